@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
@@ -151,7 +151,7 @@ def served(
 ) -> Iterator[int]:
     """Serves the page of `conf/page/local.yaml` with `changes`, and the pages of `extensions`; yields the port."""
     page: PageSettings = replace(option("page", "local"), port=port, token=TOKEN, **changes)
-    server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, *extensions)
+    server = PageServer(page, machine or MACHINE, feed, TOKEN, *extensions)
     ready, ending = threading.Event(), threading.Event()
     found, failed = list[int](), list[BaseException]()
 

@@ -11,6 +11,7 @@ import pytest
 
 from brokk_rl import extensions, registry
 from brokk_rl.build import build_node, describe_spec
+from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import find_policy
 
 extensions.register_options([])  # the exam's options are those of an extension
@@ -30,6 +31,10 @@ def option(group: str, name: str, **fields: object) -> Any:
 def _load(group: str, name: str, paths: tuple[str, ...]) -> Any:
     """Loads an option; `paths` are where packages with options of their own may lie."""
     return extensions.load_option(group, name)
+
+
+MACHINE: Machine = option("machine", "brokk170")
+"""The default machine."""
 
 
 def own_task(task: Any, policy: object) -> Any:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from composed import option
+from composed import MACHINE, option
 from websockets import Origin
 from websockets.sync.client import connect
 
@@ -80,12 +80,14 @@ def build_twin(bus: CanBus, **changes: Any) -> Twin:
     return Twin(wire=bus, seconds=None, realtime=False, **usual | changes)
 
 
-def build_feed(memory: LoopMemory, folder: Path, *camera: float) -> LoopFeed:
+def build_feed(
+    memory: LoopMemory, folder: Path, *camera: float, clock: Callable[[], float] = time.monotonic
+) -> LoopFeed:
     """Returns the page's feed of a loop of the default machine; `camera` as in its configuration."""
-    parts = (option("page", "local"), option("machine", "brokk170"), option("guidance", "machine"))
+    parts = (option("page", "local"), MACHINE, option("guidance", "machine"))
     session = Session(out=str(folder), seed=1, device="cpu")
     guard = option("guard", "default")
-    return LoopFeed(PageProcessConfig(*parts, session, guard, 600.0, *camera), memory)
+    return LoopFeed(PageProcessConfig(*parts, session, guard, 600.0, *camera), memory, clock)
 
 
 class Stop(NamedTuple):

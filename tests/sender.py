@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from composed import option
+from pathlib import Path
+
+from composed import MACHINE, option
 from desk import DBC
 
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.guard import GuardDecision, GuardInput, GuardState, GuardTrip
@@ -14,8 +17,8 @@ from deploy.kernel.receiver import BusReceiver
 from deploy.runtime.operator_state import OperatorState
 
 LIMITS = option("guard", "default")
-MACHINE = option("machine", "brokk170")
 BUS = BusDescription(DBC, MACHINE)
+DBC_TEXT = resolve_package_path(DBC).read_text()
 PERIODS_S = {
     name: one.period_s for name, one in BUS.layouts.items() if one.sender in ("GATEWAY", "REMOTE")
 }
@@ -28,6 +31,13 @@ USUAL = (
 DECISION = GuardDecision(
     GuardState.SILENT, (0.1, 0.2, 0.3, 0.4, 0.5), GuardTrip.BUS_DOWN, GuardTrip.ESTOP
 )
+
+
+def build_other_bus(folder: Path, text: str) -> BusDescription:
+    """Returns the bus of another description than the shipped one."""
+    path = folder / "other.dbc"
+    path.write_text(text)
+    return BusDescription(str(path), MACHINE)
 
 
 class Sender:

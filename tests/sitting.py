@@ -6,17 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from composed import option
+from composed import MACHINE
 
 from brokk_rl.kinematics import compute_tool_kinematics
-from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from brokk_rl.session import write_json
 from study import design, study_folder
 from study.conductor import Conductor, Consent
 from study.trial import MachineView, Times
 
-MACHINE: Machine = option("machine", "brokk170")
 CONSENT = Consent(
     version="v1", text={"en": ("You may stop at any time.",), "de": ("Sie können aufhören.",)}
 )

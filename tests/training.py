@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from composed import option
+from composed import MACHINE, option
 from kinematic import Kinematic
 
-from brokk_rl.machine import Machine
 from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
@@ -28,12 +27,10 @@ SILENT["filter"] = "none"
 """Errors of an observation that has none."""
 
 
-def plant(
-    machine: Machine, task: Any = None, sim: Any = None, follower: Any = None
-) -> SimulatedPlant:
+def plant(task: Any = None, sim: Any = None, follower: Any = None) -> SimulatedPlant:
     """Returns what a small control loop is made of."""
     return SimulatedPlant(
-        machine=machine,
+        machine=MACHINE,
         sim=sim or Kinematic(),
         task=task or option("task", "borehole_insertion"),
         actuator=option("actuator", "lag"),
@@ -59,7 +56,6 @@ def small(
 
 
 def make(
-    machine: Machine,
     folder: Path,
     training: TrainingConfig,
     loop: ControlLoop | None = None,
@@ -68,15 +64,13 @@ def make(
     """Returns a runner on a control loop of its own; every run of a test starts from the same seed."""
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
-    loop = loop or plant(machine).build(device, training.num_envs, training.num_starts, 0)
+    loop = loop or plant().build(device, training.num_envs, training.num_starts, 0)
     return TrainingRunner(loop, training, folder)
 
 
-def train(
-    machine: Machine, folder: Path, training: TrainingConfig, resume: Path | None = None
-) -> TrainingRunner:
+def train(folder: Path, training: TrainingConfig, resume: Path | None = None) -> TrainingRunner:
     """Trains until the budget is spent, from the beginning or from a checkpoint."""
-    runner = make(machine, folder, training)
+    runner = make(folder, training)
     if resume:
         # Whatever happened in this process before, the checkpoint knows better.
         torch.manual_seed(999)

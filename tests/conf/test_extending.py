@@ -10,12 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from composed import option
+from composed import MACHINE, option
 from conftest import Brokk
 from packages import install_example
 
 from brokk_rl.checks import check_actuator, check_task
-from brokk_rl.machine import Machine
 
 ROOT = Path(__file__).parents[2]
 PROJECT = ROOT / "examples/my_package"
@@ -44,9 +43,9 @@ def test_the_package_passes_its_own_tests(site: Path) -> None:
     assert "12 passed" in done.stdout
 
 
-def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machine) -> None:
-    check_actuator(option("actuator", "my_rubber"), machine)
-    check_task(option("task", "my_trace"), machine)
+def test_the_parts_work_with_the_shipped_machine_too(site: Path) -> None:
+    check_actuator(option("actuator", "my_rubber"), MACHINE)
+    check_task(option("task", "my_trace"), MACHINE)
 
 
 def test_all_of_it_trains_together(site: Path, brokk: Brokk, tmp_path: Path) -> None:

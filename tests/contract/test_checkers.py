@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 
 from brokk_rl.checks import check_actuator, check_finder, check_task
 from brokk_rl.contracts.vision import FrameDetections, HolePose
@@ -39,8 +39,8 @@ def spec_of(kind: type[Filter]) -> Any:
     return SimpleNamespace(build=lambda machine, num_envs, device: kind(machine, num_envs, device))
 
 
-def test_a_proper_actuator_passes(machine: Machine) -> None:
-    check_actuator(spec_of(Filter), machine)
+def test_a_proper_actuator_passes() -> None:
+    check_actuator(spec_of(Filter), MACHINE)
 
 
 def move_state(own: Any, history: History) -> torch.Tensor:
@@ -70,9 +70,9 @@ def write_history(own: Any, history: History) -> torch.Tensor:
         ("step", lambda own, h: Filter.step(own, h) + 1.0, "at rest"),
     ],
 )  # fmt: skip
-def test_a_broken_actuator_is_found(name: str, method: Any, message: str, machine: Machine) -> None:
+def test_a_broken_actuator_is_found(name: str, method: Any, message: str) -> None:
     with pytest.raises(AssertionError, match=message):
-        check_actuator(spec_of(type("Broken", (Filter,), {name: method})), machine)
+        check_actuator(spec_of(type("Broken", (Filter,), {name: method})), MACHINE)
 
 
 NOWHERE = torch.zeros(4, dtype=torch.bool)
@@ -104,9 +104,9 @@ def overriding(**parts: Any) -> Any:
         ({"reset": lambda original, mask, start: original(torch.ones_like(mask), start)}, "outside the mask"),
     ],
 )  # fmt: skip
-def test_a_broken_task_is_found(parts: dict[str, Any], message: str, machine: Machine) -> None:
+def test_a_broken_task_is_found(parts: dict[str, Any], message: str) -> None:
     with pytest.raises(AssertionError, match=message):
-        check_task(overriding(**parts), machine)
+        check_task(overriding(**parts), MACHINE)
 
 
 def finder_of(answer: Any) -> Any:

@@ -12,7 +12,6 @@ import training as runs
 from composed import option
 
 from brokk_rl.contracts.task import REWARD
-from brokk_rl.machine import Machine
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import Teacher
@@ -31,12 +30,10 @@ WILD = 5
 """The world that diverges."""
 
 
-def make_loop(
-    machine: Machine, sim: Any = WARP, device: torch.device = CUDA, task: Any = None
-) -> ControlLoop:
+def make_loop(sim: Any = WARP, device: torch.device = CUDA, task: Any = None) -> ControlLoop:
     torch.manual_seed(0)
     task = task or option("task", "borehole_insertion")
-    return runs.plant(machine, task, sim).build(device, NUM, 256, 5)
+    return runs.plant(task, sim).build(device, NUM, 256, 5)
 
 
 def push(loop: ControlLoop, steps: int, seed: int = 3) -> None:
@@ -48,10 +45,8 @@ def push(loop: ControlLoop, steps: int, seed: int = 3) -> None:
 # --- faults ---
 
 
-def test_a_captured_step_names_why_a_world_diverged(
-    machine: Machine, caplog: pytest.LogCaptureFixture
-) -> None:
-    loop = make_loop(machine)
+def test_a_captured_step_names_why_a_world_diverged(caplog: pytest.LogCaptureFixture) -> None:
+    loop = make_loop()
     loop.capture()
     assert loop.graph_active
     push(loop, 3)
@@ -64,9 +59,9 @@ def test_a_captured_step_names_why_a_world_diverged(
 
 
 @pytest.mark.parametrize("level", ["flat", "several", "slanted", "goal_pose"])
-def test_each_level_is_captured_with_any_noise(machine: Machine, level: str) -> None:
+def test_each_level_is_captured_with_any_noise(level: str) -> None:
     measured = option("task/noise", "measured")
-    loop = make_loop(machine, task=replace(option("task", level), noise=measured))
+    loop = make_loop(task=replace(option("task", level), noise=measured))
     loop.capture()
     assert loop.graph_active
     push(loop, 30)
@@ -79,11 +74,11 @@ OUTSIDE = ("library", "clock_offset", "encoder_scale", "link_length", "base_tilt
 
 
 @pytest.mark.parametrize("actuator", ["lag", "hydraulic", "mlp"])
-def test_actuators_and_all_effects_are_captured(machine: Machine, actuator: str) -> None:
+def test_actuators_and_all_effects_are_captured(actuator: str) -> None:
     effects = option("effect", "library").effects | {
         name: option("effect", name) for name in OUTSIDE
     }
-    plant = replace(runs.plant(machine, sim=WARP), actuator=option("actuator", actuator))
+    plant = replace(runs.plant(sim=WARP), actuator=option("actuator", actuator))
     loop = replace(plant, effect=effects).build(CUDA, NUM, 256, 5)
     loop.capture()
     assert loop.graph_active
@@ -94,8 +89,8 @@ def test_actuators_and_all_effects_are_captured(machine: Machine, actuator: str)
 # --- figures of the reward ---
 
 
-def test_the_terms_of_a_captured_reward_add_up_to_the_return(machine: Machine) -> None:
-    loop = make_loop(machine)
+def test_the_terms_of_a_captured_reward_add_up_to_the_return() -> None:
+    loop = make_loop()
     loop.capture(fuse=True)
     earned = torch.zeros(NUM, device=CUDA)
     returns: list[torch.Tensor] = []
@@ -118,16 +113,14 @@ def test_the_terms_of_a_captured_reward_add_up_to_the_return(machine: Machine) -
 @pytest.mark.parametrize(
     "teacher", [None, Teacher(weight=1.0, until=(1.0, 0.5))], ids=["alone", "led"]
 )
-def test_a_training_stays_captured(
-    machine: Machine, tmp_path: Path, teacher: Teacher | None
-) -> None:
+def test_a_training_stays_captured(tmp_path: Path, teacher: Teacher | None) -> None:
     budget = NUM * runs.STEPS * 6
     training = runs.small(max_env_steps=budget, num_envs=NUM, teacher=teacher)
     training.runner["obs_groups"]["actor"] = ["guide", "joints"]
-    loop = make_loop(machine)
+    loop = make_loop()
     loop.capture()
     folder = tmp_path / "run"
-    runner = runs.make(machine, folder, training, loop, CUDA)
+    runner = runs.make(folder, training, loop, CUDA)
     runner.run()
     assert isinstance(runner.alg, DevicePPO) and len(runner.alg._epoch or ()) == 1
     assert all(torch.isfinite(value).all() for value in runs.weights(runner).values())

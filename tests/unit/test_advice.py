@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 import training as runs
-from composed import option
+from composed import MACHINE, option
 
 from actuators.person import HumanFollower
 from brokk_rl.checks import check_task
 from brokk_rl.extensions import load_mode
-from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.machine import mask_exclusive_joints
 from brokk_rl.observation import ObservationEncoder, list_pose_parts
 from brokk_rl.rl.loop import ControlLoop
 from tasks.advice import LeverAdviser
@@ -53,11 +53,11 @@ def task(name: str = "borehole_insertion", **changes: Any) -> Any:
     ],
 )
 def test_what_is_coming_is_what_a_person_gives_when_nothing_more_is_proposed(
-    numbers: dict[str, float], off: float, off_in_all: float, machine: Machine
+    numbers: dict[str, float], off: float, off_in_all: float
 ) -> None:
     """Held against the simulated person, who moves q1, q3, q4 and q5."""
-    adviser = LeverAdviser(advice(**numbers), machine, CPU)
-    model = person(**numbers).build(machine, 1, CPU)
+    adviser = LeverAdviser(advice(**numbers), MACHINE, CPU)
+    model = person(**numbers).build(MACHINE, 1, CPU)
     given = torch.zeros(1, 5)
     drawn = torch.rand(13, 1, 5, generator=torch.Generator().manual_seed(2))
     proposed = (2 * drawn - 1) * torch.tensor([1.0, 0.0, 1.0, 1.0, 1.0])
@@ -71,18 +71,16 @@ def test_what_is_coming_is_what_a_person_gives_when_nothing_more_is_proposed(
     torch.testing.assert_close(coming.sum(1), later.sum(1), rtol=0, atol=off_in_all)
 
 
-def test_a_proposal_makes_up_for_the_lever_s_dead_zone(machine: Machine) -> None:
+def test_a_proposal_makes_up_for_the_lever_s_dead_zone() -> None:
     wanted = torch.tensor([[0.5, 0.0, -0.1, 1.0, 0.02]])
-    adviser = LeverAdviser(advice(dead_zone=0.05), machine, CPU)
+    adviser = LeverAdviser(advice(dead_zone=0.05), MACHINE, CPU)
     shown = adviser.proposal(wanted, torch.zeros(1, 13, 5))
-    given = person(dead_zone=0.05, delay_s=0.0, lag_s=0.0).build(machine, 1, CPU).step(shown)
+    given = person(dead_zone=0.05, delay_s=0.0, lag_s=0.0).build(MACHINE, 1, CPU).step(shown)
     torch.testing.assert_close(given, wanted)
 
 
-def test_no_more_levers_are_proposed_than_a_person_has_hands_for_and_each_for_a_while(
-    machine: Machine,
-) -> None:
-    adviser = LeverAdviser(advice(joints_at_once=(2, 4), hold_s=0.15), machine, CPU)
+def test_no_more_levers_are_proposed_than_a_person_has_hands_for_and_each_for_a_while() -> None:
+    adviser = LeverAdviser(advice(joints_at_once=(2, 4), hold_s=0.15), MACHINE, CPU)
     proposed = torch.zeros(1, 13, 5)
     moved = []
     for step in range(8):
@@ -96,10 +94,10 @@ def test_no_more_levers_are_proposed_than_a_person_has_hands_for_and_each_for_a_
     assert not nothing.any(), "what is no longer wanted is not proposed"
 
 
-def test_proposals_keep_the_masks(machine: Machine) -> None:
-    adviser = LeverAdviser(advice(joints_at_once=1), machine, CPU)
+def test_proposals_keep_the_masks() -> None:
+    adviser = LeverAdviser(advice(joints_at_once=1), MACHINE, CPU)
     generator = torch.Generator().manual_seed(0)
-    proposed, exclusive = torch.zeros(8, 13, 5), torch.as_tensor(machine.is_exclusive)
+    proposed, exclusive = torch.zeros(8, 13, 5), torch.as_tensor(MACHINE.is_exclusive)
     for _ in range(40):
         wanted = torch.rand(8, 5, generator=generator) * 2 - 1
         positioning = torch.rand(8, generator=generator) < 0.5
@@ -110,17 +108,15 @@ def test_proposals_keep_the_masks(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("name", ["borehole_insertion", "goal_pose"])
-def test_a_task_that_proposes_to_a_person_keeps_the_promises_of_a_task(
-    name: str, machine: Machine
-) -> None:
-    check_task(task(name), machine)
+def test_a_task_that_proposes_to_a_person_keeps_the_promises_of_a_task(name: str) -> None:
+    check_task(task(name), MACHINE)
     assert option("task", name).advice is None, "nobody stands between by default"
 
 
 @pytest.mark.parametrize("with_pitch", [False, True])
-def test_the_vector_holds_the_proposals_at_its_end(with_pitch: bool, machine: Machine) -> None:
+def test_the_vector_holds_the_proposals_at_its_end(with_pitch: bool) -> None:
     scaling = option("task", "goal_pose" if with_pitch else "borehole_insertion").scaling
-    parts = list_pose_parts(machine, scaling, with_proposals=True)
+    parts = list_pose_parts(MACHINE, scaling, with_proposals=True)
     encoder = ObservationEncoder(parts, torch.tensor, torch.cat)
     values = {part.name: torch.rand(2, *part.shape) for part in parts}
     vector = encoder.encode(values)
@@ -131,15 +127,15 @@ def test_the_vector_holds_the_proposals_at_its_end(with_pitch: bool, machine: Ma
     assert encoder.describe()["order"][-1] == "proposals oldest first (H x J)"
 
 
-def loop_of(machine: Machine) -> ControlLoop:
+def loop_of() -> ControlLoop:
     torch.manual_seed(0)
     quiet = replace(task().noise, q_scale=0.0, u_scale=0.0)
-    plant = runs.plant(machine, task(noise=quiet), follower=option("follower", "person"))
+    plant = runs.plant(task(noise=quiet), follower=option("follower", "person"))
     return plant.build(CPU, 6, 64, 5)
 
 
-def test_the_policy_sees_what_it_proposed_and_what_was_given(machine: Machine) -> None:
-    loop, proposals = loop_of(machine), []
+def test_the_policy_sees_what_it_proposed_and_what_was_given() -> None:
+    loop, proposals = loop_of(), []
     for action in torch.randn(5, 6, 5):
         loop.step(action)
         proposals.append(loop.task.state["u"].clone())
@@ -154,8 +150,8 @@ def test_the_policy_sees_what_it_proposed_and_what_was_given(machine: Machine) -
     assert not seen[:, -65:].any(), "a new episode has proposed nothing"
 
 
-def test_what_is_deployed_proposes_what_training_proposed(machine: Machine) -> None:
-    loop = loop_of(machine)
+def test_what_is_deployed_proposes_what_training_proposed() -> None:
+    loop = loop_of()
     deployed = loop.task.deployable(lambda groups: groups["policy"][:, 3:8])  # type: ignore[arg-type]
     for _ in range(30):
         vector = loop.get_observations()["policy"]
@@ -164,8 +160,8 @@ def test_what_is_deployed_proposes_what_training_proposed(machine: Machine) -> N
         torch.testing.assert_close(loop.task.state["u"], expected, rtol=0, atol=1e-4)
 
 
-def test_a_contract_says_what_the_policy_knows_of_the_person(machine: Machine) -> None:
-    told = task().build(machine, 1, CPU).describe()
+def test_a_contract_says_what_the_policy_knows_of_the_person() -> None:
+    told = task().build(MACHINE, 1, CPU).describe()
     assert told["size"] == 198 and told["advice"]["delay_s"] == (0.2, 0.4)
     assert told["advice"]["joints_at_once"] == (2, 4)
-    assert "advice" not in option("task", "borehole_insertion").build(machine, 1, CPU).describe()
+    assert "advice" not in option("task", "borehole_insertion").build(MACHINE, 1, CPU).describe()

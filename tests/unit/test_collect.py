@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from conftest import Brokk
 from motion import rest
 
@@ -35,9 +35,9 @@ SMALL = (
 )
 
 
-def made(folder: Path, machine: Machine) -> dict[str, Recording]:
+def made(folder: Path) -> dict[str, Recording]:
     paths = sorted((folder / "recordings").glob("*.parquet"))
-    return {path.stem: record.read_recording(path, machine) for path in paths}
+    return {path.stem: record.read_recording(path, MACHINE) for path in paths}
 
 
 def mode(out: Path, *overrides: str) -> Collect:
@@ -52,10 +52,8 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_run_is_cut_into_files_that_know_each_other(
-    collected: Path, machine: Machine
-) -> None:
-    files = made(collected, machine)
+def test_every_run_is_cut_into_files_that_know_each_other(collected: Path) -> None:
+    files = made(collected)
     assert list(files) == [f"sine_{n:02d}_{part:02d}" for n in range(2) for part in range(3)]
     assert [file.num_samples for file in files.values()] == [240, 240, 120] * 2
     runs = [file.metadata["run"] for file in files.values()]
@@ -64,7 +62,7 @@ def test_every_run_is_cut_into_files_that_know_each_other(
     assert second.metadata["created"] == record.add_seconds(first.metadata["created"], 12.0)
     assert first.metadata["source"] == "simulator: Lag, excitation: sine"
     assert first.metadata["seed"] == "0"
-    assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()
+    assert json.loads(first.metadata["fingerprint"]) == MACHINE.fingerprint()
     assert first.t_s[0] == second.t_s[0] == 0.0
 
 
@@ -81,23 +79,23 @@ def test_only_the_plan_is_drawn_and_what_finds_no_time_is_named(
 
 
 def test_the_same_seed_records_the_same_and_another_does_not(
-    collected: Path, machine: Machine, tmp_path: Path
+    collected: Path, tmp_path: Path
 ) -> None:
     for out, seed in ((tmp_path / "again", 0), (tmp_path / "other", 1)):
         torch.rand(3)  # whatever else drew from the global generator
         mode(out, *SMALL, f"session.seed={seed}").run()
     folders = (collected, tmp_path / "again", tmp_path / "other")
-    first, again, other = (made(folder, machine) for folder in folders)
+    first, again, other = (made(folder) for folder in folders)
     for name, file in first.items():
         assert np.array_equal(file.u, again[name].u) and np.array_equal(file.q, again[name].q)
     assert any(not np.array_equal(file.u, other[name].u) for name, file in first.items())
 
 
-def test_actuator_and_effects_are_chosen_as_everywhere(brokk: Brokk, machine: Machine) -> None:
+def test_actuator_and_effects_are_chosen_as_everywhere(brokk: Brokk) -> None:
     small = ("collect.num_runs=1", "collect.run_minutes=0.4", "collect.file_minutes=0.4")
     chosen = ("actuator=hydraulic", "effect=[backlash,stiction]", "effect.backlash.gap_rad=0.01")
     brokk("mode=collect", "session.out=run", "excitation=levels", *chosen, *small)
-    (file,) = made(Path("run"), machine).values()
+    (file,) = made(Path("run")).values()
     source = "simulator: Hydraulic + backlash + stiction, excitation: levels"
     assert file.metadata["source"] == source
     assert file.extra["oil_c"].shape == (file.num_samples,) and 0.0 < file.extra["oil_c"][0] < 60.0
@@ -132,12 +130,12 @@ class Connected:
 
 @pytest.mark.parametrize("link", [Fails, Interrupted])
 def test_what_was_recorded_before_an_interruption_is_kept(
-    link: type[Fails], tmp_path: Path, machine: Machine
+    link: type[Fails], tmp_path: Path
 ) -> None:
     collect = replace(mode(tmp_path / "run", *SMALL), link=Connected(link))
     with pytest.raises(link.error):
         collect.run()
-    files = made(tmp_path / "run", machine)
+    files = made(tmp_path / "run")
     assert [file.num_samples for file in files.values()] == [240, 160] * 2
 
 
@@ -187,16 +185,14 @@ class RealTime(NominalLink):
         return Command(np.asarray(command.u) * 0.5)  # a guard on the machine halves it
 
 
-def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(
-    tmp_path: Path, machine: Machine
-) -> None:
+def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(tmp_path: Path) -> None:
     small = ("collect.num_runs=1", "collect.run_minutes=0.04", "collect.file_minutes=0.04")
     asked = mode(tmp_path / "run", "excitation=levels", *small)
     collect = replace(asked, link=Connected(RealTime))
     before = time.monotonic()
     collect.run()
     assert time.monotonic() - before > 2.2
-    files = list(made(tmp_path / "run", machine).values())
+    files = list(made(tmp_path / "run").values())
     first, last = files[0], files[-1]
     assert first.metadata["run"] == last.metadata["run"] and first is not last
     # Busy computers come late more than once.
@@ -211,18 +207,16 @@ def surround(actuator: str, *effects: str) -> ActuatorWithEffects:
     return ActuatorWithEffects(actuator=option("actuator", actuator), effects=chosen)
 
 
-def test_a_simulated_machine_is_its_actuator_model_with_noise(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_a_simulated_machine_is_its_actuator_model_with_noise(tmp_path: Path) -> None:
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     links = []
     for effects, noise in ((("backlash",), 0.0), (("backlash",), 0.01), ((), 0.0)):
         plant = surround("lag", *effects)
         spec = SimulatedMachines(actuator=plant, noise=noise, one_machine=True)
-        links.append(spec.build(machine, 2, session))
+        links.append(spec.build(MACHINE, 2, session))
     quiet, noisy, neutral = links
-    model = option("actuator", "lag").build(machine, 2, torch.device("cpu"))
-    history = rest(machine, num=2)
+    model = option("actuator", "lag").build(MACHINE, 2, torch.device("cpu"))
+    history = rest(MACHINE, num=2)
     generator, differences, played = np.random.default_rng(0), [], []
     for _ in range(200):
         u = generator.uniform(-1, 1, (2, 5)).astype(np.float32)
@@ -240,11 +234,11 @@ def test_a_simulated_machine_is_its_actuator_model_with_noise(
 
 @pytest.mark.parametrize("one_machine", [True, False])
 def test_all_runs_record_one_machine_where_effects_are_drawn(
-    one_machine: bool, machine: Machine, tmp_path: Path
+    one_machine: bool, tmp_path: Path
 ) -> None:
     plant = surround("ideal", "asymmetry")
     connection = SimulatedMachines(actuator=plant, noise=0.0, one_machine=one_machine)
-    link = connection.build(machine, 3, Session(out=str(tmp_path), seed=0, device="cpu"))
+    link = connection.build(MACHINE, 3, Session(out=str(tmp_path), seed=0, device="cpu"))
     for _ in range(60):
         link.send(Command(np.full((3, 5), 0.4)))
     spread = np.ptp(link.read().q, axis=0).max()

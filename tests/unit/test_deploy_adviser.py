@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 
 from deploy.guidance import HandLag
 from deploy.kernel.guard import GuardTrip
@@ -21,7 +21,6 @@ from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.shared_memory import RecordLayout
 from deploy.runtime.shm_layout import TEXT, LoopMemory
 
-MACHINE = option("machine", "brokk170")
 NUM_JOINTS, NUM_HISTORY = MACHINE.num_joints, MACHINE.num_history
 CONFIG = PolicyProcessConfig(MACHINE, "nowhere", option("guidance", "machine"), 0.15, 60.0, 0.3)
 ANSWER = np.array([0.5, 0.0, -0.4, 0.0, 0.1])

@@ -10,13 +10,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE
 from conftest import Brokk
 from desk import DBC, build_twin, free_port, wire
 
 from actuators.excite.player import NominalMachine
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine
 from deploy.bringup import JointResponse, _StateChecks, describe_joint, find_pushes
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
@@ -24,7 +23,6 @@ from deploy.twin.rehearsal import RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
 
 T_S = np.arange(0, 40, 0.01)
-MACHINE = option("machine", "brokk170")
 
 
 def sample_machine(dead_s: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
@@ -191,7 +189,7 @@ def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("fails", [None, "e-stop"])
 def test_the_checklist_finds_a_sound_machine_and_a_check_that_fails(
-    brokk: Brokk, machine: Machine, tmp_path: Path, fails: str | None
+    brokk: Brokk, tmp_path: Path, fails: str | None
 ) -> None:
     brokk(
         "mode=bringup", "bus=udp", "bus.channel=239.74.163.78", f"bus.port={free_port()}", "bench=operator",
@@ -206,4 +204,4 @@ def test_the_checklist_finds_a_sound_machine_and_a_check_that_fails(
     failed = [name for name, one in findings.items() if not one["passed"]]
     assert failed == ([fails] if fails else [])
     joint = findings["joints"]["values"]["q1"]
-    assert joint["dead_time_s"] == pytest.approx(machine.dead_time_s, abs=0.1)
+    assert joint["dead_time_s"] == pytest.approx(MACHINE.dead_time_s, abs=0.1)

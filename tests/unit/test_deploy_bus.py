@@ -11,55 +11,47 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from composed import MACHINE
 from desk import DBC
 from desk import wire as udp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sender import BUS, DBC_TEXT, build_other_bus
 
 from brokk_rl.errors import ConfigError, LinkError
-from brokk_rl.machine import Machine
-from deploy.bus import description as described
 from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
 
 
-@pytest.fixture(scope="module")
-def bus(machine: Machine) -> BusDescription:
-    return BusDescription(DBC, machine)
-
-
 @settings(max_examples=50)
 @given(st.lists(st.floats(-1, 1), min_size=5, max_size=5), st.integers(0, 100))
-def test_commands_arrive_as_they_were_sent_to_half_a_step(
-    machine: Machine, u: list[float], counter: int
-) -> None:
-    bus = BusDescription(DBC, machine)
+def test_commands_arrive_as_they_were_sent_to_half_a_step(u: list[float], counter: int) -> None:
     names = [f"Command_q{j}" for j in range(1, 6)]
-    data = bus.encode("ValveCmd", dict(zip(names, u, strict=True)) | {"CommandMode": 1}, counter)
-    values = bus.decode(bus.command, data)
+    data = BUS.encode("ValveCmd", dict(zip(names, u, strict=True)) | {"CommandMode": 1}, counter)
+    values = BUS.decode(BUS.command, data)
     assert values["Counter"] == counter % 16
     assert values["CommandMode"] == 1
     for name, wanted in zip(names, u, strict=True):
         assert abs(values[name] - wanted) <= 0.002 + 1e-12
 
 
-def test_every_single_wrong_bit_is_found_in_every_message(bus: BusDescription) -> None:
-    for layout in bus.layouts.values():
-        data = bus.encode(layout.name, {}, 3)
+def test_every_single_wrong_bit_is_found_in_every_message() -> None:
+    for layout in BUS.layouts.values():
+        data = BUS.encode(layout.name, {}, 3)
         for bit in range(8 * len(data)):
             wrong = bytearray(data)
             wrong[bit // 8] ^= 1 << bit % 8
-            assert bus.decode(layout, bytes(wrong)) is MessageFault.CRC
+            assert BUS.decode(layout, bytes(wrong)) is MessageFault.CRC
 
 
-def test_a_message_under_the_name_of_another_is_found(bus: BusDescription) -> None:
+def test_a_message_under_the_name_of_another_is_found() -> None:
     for one, other in itertools.permutations(
-        [layout for layout in bus.layouts.values() if layout.length == 8], 2
+        [layout for layout in BUS.layouts.values() if layout.length == 8], 2
     ):
-        assert bus.decode(other, bus.encode(one.name, {}, 1)) is MessageFault.CRC
-    assert bus.decode(bus.command, bus.encode("ValveCmd", {}, 1)[:-1]) is MessageFault.LENGTH
+        assert BUS.decode(other, BUS.encode(one.name, {}, 1)) is MessageFault.CRC
+    assert BUS.decode(BUS.command, BUS.encode("ValveCmd", {}, 1)[:-1]) is MessageFault.LENGTH
 
 
 def _virtual(tmp_path: Path) -> CanBus:
@@ -122,50 +114,39 @@ def test_a_wire_that_is_not_there_is_an_error_that_says_what_to_change() -> None
     ids=["signal", "crc", "factor", "twice", "missing", "apart", "syntax"],
 )  # fmt: skip
 def test_a_description_that_does_not_do_is_refused(
-    machine: Machine, tmp_path: Path, old: str, new: str, message: str
+    tmp_path: Path, old: str, new: str, message: str
 ) -> None:
-    text = described.resolve_package_path(DBC).read_text()
-    assert old in text
-    path = tmp_path / "other.dbc"
-    text = text.replace(old, new, 1)
+    assert old in DBC_TEXT
+    text = DBC_TEXT.replace(old, new, 1)
     if new.endswith("Flow_q5 : 8"):  # moved, not doubled
         text = text.replace("SG_ Flow_q5 : 36", "SG_ Spare : 36", 1)
-    path.write_text(text)
     with pytest.raises(ConfigError, match=message):
-        BusDescription(str(path), machine)
+        build_other_bus(tmp_path, text)
 
 
 @pytest.mark.parametrize(
     "message", ["ValveCmd", "JointPos2", "LeverState", "ValveFeedback", "MachineStatus"]
 )
 def test_where_commands_are_sent_all_that_they_depend_on_is_protected(
-    bus: BusDescription, machine: Machine, tmp_path: Path, message: str
+    tmp_path: Path, message: str
 ) -> None:
-    bus.check_protection()
-    mark = f'BA_ "E2EDataId" BO_ {1 << 31 | bus.layouts[message].frame_id}'
-    lines = described.resolve_package_path(DBC).read_text().splitlines()
-    path = tmp_path / "other.dbc"
-    path.write_text("\n".join(line for line in lines if not line.startswith(mark)))
+    BUS.check_protection()
+    mark = f'BA_ "E2EDataId" BO_ {1 << 31 | BUS.layouts[message].frame_id}'
+    text = "\n".join(line for line in DBC_TEXT.splitlines() if not line.startswith(mark))
     with pytest.raises(ConfigError, match=f"E2EDataId for message {message}"):
-        BusDescription(str(path), machine).check_protection()
+        build_other_bus(tmp_path, text).check_protection()
 
 
-def test_another_layout_with_the_same_names_is_as_good(machine: Machine, tmp_path: Path) -> None:
-    text = (
-        described.resolve_package_path(DBC)
-        .read_text()
-        .replace("2365591591", "291")
-        .replace('"GenMsgCycleTime" BO_ 291 20', '"GenMsgCycleTime" BO_ 291 50')
-    )
-    path = tmp_path / "other.dbc"
-    path.write_text(text)
-    bus = BusDescription(str(path), machine)
+def test_another_layout_with_the_same_names_is_as_good(tmp_path: Path) -> None:
+    text = DBC_TEXT.replace("2365591591", "291")
+    text = text.replace('"GenMsgCycleTime" BO_ 291 20', '"GenMsgCycleTime" BO_ 291 50')
+    bus = build_other_bus(tmp_path, text)
     assert bus.command.frame_id == 291 and not bus.command.extended and bus.command.period_s == 0.05
 
 
-def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
-    joints = tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(machine.joints))
-    other = replace(machine, joints=joints, exclusive=(), levers=())
+def test_a_description_for_other_joints_is_refused() -> None:
+    joints = tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(MACHINE.joints))
+    other = replace(MACHINE, joints=joints, exclusive=(), levers=())
     with pytest.raises(ConfigError, match="Command_j0"):
         BusDescription(DBC, other)
 
@@ -173,9 +154,9 @@ def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
 HEADER_TIMES = (0.15, 0.13, 0.07)
 
 
-def compile_c(tmp_path: Path, bus: BusDescription, body: str) -> list[str]:
+def compile_c(tmp_path: Path, body: str) -> list[str]:
     """Compile a program with the header; return its output as words."""
-    (tmp_path / "bus.h").write_text(generate_c_header(bus, *HEADER_TIMES))
+    (tmp_path / "bus.h").write_text(generate_c_header(BUS, *HEADER_TIMES))
     text = f'#include <stdio.h>\n#include "bus.h"\nint main(void) {{\n{body}\nreturn 0;\n}}'
     (tmp_path / "main.c").write_text(text)
     flags = ["-Wall", "-Wextra", "-Werror", "-std=c99"]
@@ -188,13 +169,12 @@ NEEDS_C = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compi
 
 
 @NEEDS_C
-def test_the_header_computes_the_same_crc_in_c(bus: BusDescription, tmp_path: Path) -> None:
-    layout = bus.command
-    data = bus.encode("ValveCmd", {"Command_q1": 0.4, "Stamp": 3.0}, 5)
+def test_the_header_computes_the_same_crc_in_c(tmp_path: Path) -> None:
+    layout = BUS.command
+    data = BUS.encode("ValveCmd", {"Command_q1": 0.4, "Stamp": 3.0}, 5)
     numbers = ", ".join(map(str, data))
     found = compile_c(
         tmp_path,
-        bus,
         f"const uint8_t data[] = {{{numbers}}};\nbrokk_channel unused = {{0}};\n(void)brokk_take; (void)unused;\n"
         'printf("%d", brokk_crc8(data, BROKK_VALVE_CMD_LENGTH, BROKK_VALVE_CMD_CRC_BYTE, BROKK_VALVE_CMD_DATA_ID));',
     )
@@ -202,11 +182,9 @@ def test_the_header_computes_the_same_crc_in_c(bus: BusDescription, tmp_path: Pa
 
 
 @NEEDS_C
-def test_the_header_decides_about_messages_as_the_python_side_does(
-    bus: BusDescription, tmp_path: Path
-) -> None:
+def test_the_header_decides_about_messages_as_the_python_side_does(tmp_path: Path) -> None:
     """Ten thousand messages of good and bad senders: late, repeated, lost, corrupt, in floods, after silence."""
-    chance, layout = random.Random(3), bus.command
+    chance, layout = random.Random(3), BUS.command
     wrap_ms = round(1e3 * layout.stamp_wrap_s)
     channel = layout.open_channel()
     rows, expected = [], []
@@ -230,7 +208,6 @@ def test_the_header_decides_about_messages_as_the_python_side_does(
     table = ",".join(f"{{{a},{b},{c},{d}}}" for a, b, c, d in rows)
     found = compile_c(
         tmp_path,
-        bus,
         f"static const uint32_t rows[][4] = {{{table}}};\n"
         "brokk_channel c = {.modulus = BROKK_VALVE_CMD_COUNTER_MODULUS, .period_ms = BROKK_VALVE_CMD_PERIOD_MS,"
         " .wrap_ms = BROKK_VALVE_CMD_STAMP_WRAP_MS};\n"
@@ -242,12 +219,12 @@ def test_the_header_decides_about_messages_as_the_python_side_does(
     assert list(zip(map(int, found[::2]), map(int, found[1::2]), strict=True)) == expected
 
 
-def test_the_header_for_a_gateway_says_what_the_description_says(bus: BusDescription) -> None:
-    text = generate_c_header(bus, *HEADER_TIMES)
+def test_the_header_for_a_gateway_says_what_the_description_says() -> None:
+    text = generate_c_header(BUS, *HEADER_TIMES)
     # Without them no gateway could say that it goes by this description, and nothing would ever move.
     for line in (
-        f"BROKK_DESCRIPTION_HASH 0x{bus.identity['DescriptionHash']:06X}u",
-        f"BROKK_MACHINE_HASH 0x{bus.identity['MachineHash']:06X}u",
+        f"BROKK_DESCRIPTION_HASH 0x{BUS.identity['DescriptionHash']:06X}u",
+        f"BROKK_MACHINE_HASH 0x{BUS.identity['MachineHash']:06X}u",
         "BROKK_VALVE_CMD_ID 0xD001027u",
         "BROKK_VALVE_CMD_DATA_ID 0x1031u",
         "BROKK_VALVE_CMD_STAMP_WRAP_MS 1024u",
@@ -260,11 +237,9 @@ def test_the_header_for_a_gateway_says_what_the_description_says(bus: BusDescrip
         assert f"#define {line}\n" in text
 
 
-def test_stamps_are_wrapped_and_rounded_down_to_the_resolution_of_each_message(
-    bus: BusDescription,
-) -> None:
+def test_stamps_are_wrapped_and_rounded_down_to_the_resolution_of_each_message() -> None:
     # 197.743 s, modulo 1.024 s, 2.048 s, 65.536 s and 2.048 s
     wanted = {"ValveCmd": 0.096, "LeverState": 1.128, "JointPos1": 1.135, "ValveFeedback": 1.120}
     for name, stamp_s in wanted.items():
-        values = bus.decode(bus.layouts[name], bus.encode(name, {"Stamp": 197.743}, 0))
+        values = BUS.decode(BUS.layouts[name], BUS.encode(name, {"Stamp": 197.743}, 0))
         assert isinstance(values, dict) and values["Stamp"] == pytest.approx(stamp_s)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 from desk import DBC
 
 from brokk_rl.errors import LinkError
@@ -25,7 +25,7 @@ from deploy.kernel.target_check import SeenTarget
 from deploy.runtime.operator_state import OperatorControls, PageSignal, RequestedCommand
 from deploy.runtime.shm_layout import TEXT, LoopMemory
 
-MACHINE, LIMITS = option("machine", "brokk170"), option("guard", "default")
+LIMITS = option("guard", "default")
 STILL = GuardDecision(GuardState.READY, (0.0,) * 5, GuardTrip.DEADMAN, GuardTrip.NONE)
 BEGIN_S, CYCLE_S, SLEWED_S = 5000.0, 0.01, 0.5
 FRAMES = [CanFrame(0x100 + number, bytes([number])) for number in range(4)]

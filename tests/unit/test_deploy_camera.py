@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from block import TARGETS, seen_at, take_frame
-from composed import option
+from composed import MACHINE
 from desk import build_feed
 
 from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
@@ -41,7 +41,6 @@ from deploy.runtime.target import (
     read_holes,
 )
 
-MACHINE = option("machine", "brokk170")
 FRAME = take_frame((640, 360), 0, 12.0)
 PIXELS = 640 * 360
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 
 from brokk_rl.kinematics import compute_tool_kinematics
 from deploy.kernel.flow_check import FROM_PC, LEVERS, NOBODY, FlowCheck
@@ -18,7 +18,7 @@ from deploy.kernel.target_check import SeenTarget, TargetCheck
 LIMITS = FlowLimits(tolerance=0.02, settle_s=0.04, num_messages=2, lever_scale=1.5)
 ROUND_TRIP_S, UP = 0.15, (0.0, 0.0, 1.0)
 STILL = (0.0, 0.0, 0.0)
-MACHINE, GUARD = option("machine", "brokk170"), option("guard", "default")
+GUARD = option("guard", "default")
 
 
 class Valves:

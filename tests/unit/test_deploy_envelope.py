@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 
 import brokk_rl.sim
 from brokk_rl.errors import ConfigError
@@ -27,7 +27,6 @@ from deploy.checks.shapes import MachineShapes, read_machine_shapes
 from deploy.kernel.limits import EnvelopeLimits, Numbers, StayOutBox
 from deploy.kernel.under_way import CommandsUnderWay
 
-MACHINE = option("machine", "brokk170")
 GUARD = option("guard", "default")
 LIMITS = GUARD.envelope
 SHIPPED = resolve_package_path(LIMITS.shapes)

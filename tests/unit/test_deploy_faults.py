@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from composed import MACHINE
 from stage import DBC, Mode, Stage
 
 from brokk_rl.errors import StorageError
-from brokk_rl.machine import Machine
 from deploy.recorder import capture_reader
 from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.capture import run as record
@@ -28,12 +28,10 @@ COMMANDING = ("collect", "auto")
 
 
 @pytest.fixture(scope="module")
-def stages(
-    machine: Machine, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[dict[str, Stage]]:
+def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stage]]:
     # Space and motion of the arm are other tests: here they would take a third of the time.
     found = {
-        mode: Stage(machine, mode, tmp_path_factory.mktemp(mode), watched=False) for mode in MODES
+        mode: Stage(MACHINE, mode, tmp_path_factory.mktemp(mode), watched=False) for mode in MODES
     }
     yield found
     for stage in found.values():
@@ -115,10 +113,10 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero(
 
 
 def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
-    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    memory = LoopMemory(machine.num_joints, commands=False)
-    capture = CaptureConfig(tmp_path, DBC, machine, {"source": "test"}, 0.0)
+    memory = LoopMemory(MACHINE.num_joints, commands=False)
+    capture = CaptureConfig(tmp_path, DBC, MACHINE, {"source": "test"}, 0.0)
     sync, flush, count = os.fsync, CaptureWriter.flush, [0]
 
     def full(file: int) -> None:
@@ -169,9 +167,9 @@ def test_what_a_bridge_does_ends_the_motion_in_time_and_for_good(
 
 @pytest.mark.parametrize(("mode", "way"), [("collect", "to_pc"), ("auto", "to_gateway")])
 def test_a_delay_that_was_always_there_is_measured_and_nothing_moves(
-    machine: Machine, tmp_path: Path, mode: Any, way: str
+    tmp_path: Path, mode: Any, way: str
 ) -> None:
-    stage = Stage(machine, mode, tmp_path)
+    stage = Stage(MACHINE, mode, tmp_path)
     stage.bridge.delay_s = {way: 0.2}
     for _ in range(3):
         stage.fault("none")

@@ -14,18 +14,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE
 from conftest import Note
+from desk import build_feed
 from stage import DBC, Mode, Stage
 
 from brokk_rl.kinematics import compute_tool_kinematics
-from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
-from brokk_rl.session import Session
 from deploy.kernel.guard import GuardState
 from deploy.kernel.limits import StayOutBox
 from deploy.page.alarms import list_alarms
-from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 
 IN_TIME_MS = 100
 
@@ -38,12 +36,8 @@ class Watch:
     """
 
     def __init__(self, stage: Stage, folder: Path) -> None:
-        session = Session(out=str(folder), seed=0, device="cpu")
-        page, guidance = option("page", "local"), option("guidance", "machine")
-        limits = option("guard", "default")
-        config = PageProcessConfig(page, stage.machine, guidance, session, limits, 600.0)
         self.stage, self.told_ms = stage, dict[str, int]()
-        self._feed = LoopFeed(config, stage.memory, lambda: stage.now_s)
+        self._feed = build_feed(stage.memory, folder, clock=lambda: stage.now_s)
 
     def go(self, seconds: float) -> None:
         """Let time go by from an injection on."""
@@ -60,22 +54,20 @@ class Watch:
 
 
 @pytest.fixture(scope="module")
-def watches(
-    machine: Machine, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[dict[str, Watch]]:
+def watches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Watch]]:
     folder, found = tmp_path_factory.mktemp("found"), {}
     modes: tuple[Mode, ...] = ("listen", "collect")
     for mode in modes:
-        found[mode] = Watch(Stage(machine, mode, folder), folder)
+        found[mode] = Watch(Stage(MACHINE, mode, folder), folder)
     yield found
     for watch in found.values():
         watch.stage.close()
 
 
 @pytest.fixture
-def stage(machine: Machine, tmp_path: Path) -> Iterator[Stage]:
+def stage(tmp_path: Path) -> Iterator[Stage]:
     """A stage of its own that collects and is under way."""
-    stage = Stage(machine, "collect", tmp_path)
+    stage = Stage(MACHINE, "collect", tmp_path)
     stage.get_going()
     yield stage
     stage.close()
@@ -101,9 +93,9 @@ def change_valves(stage: Stage, change: Callable[[np.ndarray], np.ndarray]) -> N
     ],
 )
 def test_where_nothing_is_sent_a_sensors_fault_is_told(
-    machine: Machine, tmp_path: Path, fault: str, alarm: str, record_property: Note
+    tmp_path: Path, fault: str, alarm: str, record_property: Note
 ) -> None:
-    stage = Stage(machine, "listen", tmp_path)
+    stage = Stage(MACHINE, "listen", tmp_path)
     watch = Watch(stage, tmp_path)
     stage.get_going()
     stage.fault("lever")
@@ -181,7 +173,7 @@ DESCRIPTIONS = {
 @pytest.mark.parametrize("kind", DESCRIPTIONS)
 @pytest.mark.parametrize("side", ["dbc", pytest.param("twin_dbc", marks=pytest.mark.slow)])
 def test_ends_of_other_descriptions_never_get_ready(
-    machine: Machine, tmp_path: Path, kind: str, side: str, record_property: Note
+    tmp_path: Path, kind: str, side: str, record_property: Note
 ) -> None:
     text, path = resolve_package_path(DBC).read_text(), tmp_path / "other.dbc"
     for old, new in DESCRIPTIONS[kind]:
@@ -189,7 +181,7 @@ def test_ends_of_other_descriptions_never_get_ready(
         text = text.replace(old, new)
     path.write_text(text)
     ends = {"dbc": DBC, "twin_dbc": DBC} | {side: str(path)}
-    stage = Stage(machine, "collect", tmp_path, again_s=0.5, **ends)
+    stage = Stage(MACHINE, "collect", tmp_path, again_s=0.5, **ends)
     highest, moved_ms = [0], [0]
 
     def look() -> bool:
@@ -246,10 +238,10 @@ def test_a_borehole_that_jumps_is_not_followed(
 
 
 def test_the_seen_face_is_met_slowly_whatever_borehole_is_chosen(
-    machine: Machine, stage: Stage, record_property: Note
+    stage: Stage, record_property: Note
 ) -> None:
     def locate_tip() -> np.ndarray:
-        return np.asarray(compute_tool_kinematics(machine, np.asarray(stage.twin._q)).tip_in_base_m)
+        return np.asarray(compute_tool_kinematics(MACHINE, np.asarray(stage.twin._q)).tip_in_base_m)
 
     # The chosen borehole lies more than a metre aside, on the level of the seen one.
     aside_m = np.array([0.3, 1.2, 0.0])
@@ -283,16 +275,16 @@ def test_the_seen_face_is_met_slowly_whatever_borehole_is_chosen(
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_inside_a_box_the_slew_turns_outward_alone(
-    machine: Machine, tmp_path: Path, side: float, record_property: Note
+    tmp_path: Path, side: float, record_property: Note
 ) -> None:
-    tip_m = compute_tool_kinematics(machine, np.asarray(machine.home)).tip_in_base_m
+    tip_m = compute_tool_kinematics(MACHINE, np.asarray(MACHINE.home)).tip_in_base_m
     x, y, z = map(float, tip_m)
     # The tip is 10 cm inside, and left is deeper.
     box = StayOutBox(lower_m=(x - 1.0, y - 0.1, z - 0.5), upper_m=(x + 1.0, y + 3.0, z + 0.5))
-    stage = Stage(machine, "collect", tmp_path, again_s=1.0, stay_out={"box": box})
+    stage = Stage(MACHINE, "collect", tmp_path, again_s=1.0, stay_out={"box": box})
     stage.wanted = (0.5 * side, 0.0, 0.0, 0.0, 0.0)
     stage.go(6.0)
-    turned_rad = float(stage.twin._q[0] - machine.home[0])
+    turned_rad = float(stage.twin._q[0] - MACHINE.home[0])
     stage.close()
     if side > 0:
         assert turned_rad == pytest.approx(0.0, abs=1e-3)
@@ -303,15 +295,15 @@ def test_inside_a_box_the_slew_turns_outward_alone(
 
 @pytest.mark.parametrize("side", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_a_joint_with_a_long_dead_time_rests_before_its_stop(
-    machine: Machine, tmp_path: Path, side: float, record_property: Note
+    tmp_path: Path, side: float, record_property: Note
 ) -> None:
-    slow = replace(machine, dead_time_s=0.55)
+    slow = replace(MACHINE, dead_time_s=0.55)
     stage = Stage(slow, "collect", tmp_path, again_s=1.0, watched=False)
     stage.wanted, beyond_rad = (side, 0.0, 0.0, 0.0, 0.0), [-math.inf]
 
     def look() -> bool:
         q = float(stage.twin._q[0])
-        end = float(machine.upper[0] if side > 0 else machine.lower[0])
+        end = float(MACHINE.upper[0] if side > 0 else MACHINE.lower[0])
         beyond_rad[0] = max(beyond_rad[0], side * (q - end))
         return False
 
@@ -399,10 +391,8 @@ def test_valves_are_not_hammered(
 
 
 @pytest.mark.slow
-def test_a_dead_man_that_nobody_holds_is_asked_about(
-    machine: Machine, tmp_path: Path, record_property: Note
-) -> None:
-    stage = Stage(machine, "collect", tmp_path, watched=False)
+def test_a_dead_man_that_nobody_holds_is_asked_about(tmp_path: Path, record_property: Note) -> None:
+    stage = Stage(MACHINE, "collect", tmp_path, watched=False)
     stage.get_going()
     watch, begun_ms = Watch(stage, tmp_path), stage.ms
 

@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from composed import names, option
+from composed import MACHINE, names, option
 from desk import DBC, build_twin
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.twin.bench import GamepadBench
@@ -31,8 +30,8 @@ AXIS, BUTTON = 0x02, 0x01
 class Wire:
     """A bus on which the gateway says its time, and a person acts after each message."""
 
-    def __init__(self, machine: Machine, acts: list[Any]) -> None:
-        self._bus, self._acts, self._counter = BusDescription(DBC, machine), acts, 0
+    def __init__(self, acts: list[Any]) -> None:
+        self._bus, self._acts, self._counter = BusDescription(DBC, MACHINE), acts, 0
         self.sent: list[dict[str, float]] = []
 
     @contextlib.contextmanager
@@ -53,9 +52,7 @@ class Wire:
             self._acts.pop(0)()
 
 
-def test_sticks_are_levers_shoulders_are_dead_man_and_button_and_unplugged_is_silent(
-    machine: Machine,
-) -> None:
+def test_sticks_are_levers_shoulders_are_dead_man_and_button_and_unplugged_is_silent() -> None:
     pad, device = os.openpty()
     tty.setraw(device)
 
@@ -70,10 +67,10 @@ def test_sticks_are_levers_shoulders_are_dead_man_and_button_and_unplugged_is_si
         act((BUTTON, 4, 0)),
         lambda: os.close(pad),
     ]
-    wire = Wire(machine, acts)
+    wire = Wire(acts)
     end_s = time.monotonic() + 10.0
     settings = replace(REMOTE, device=os.ttyname(device))
-    run_remote(lambda: time.monotonic() > end_s, wire, DBC, machine, settings, None)  # type: ignore[arg-type]
+    run_remote(lambda: time.monotonic() > end_s, wire, DBC, MACHINE, settings, None)  # type: ignore[arg-type]
     os.close(device)
     assert time.monotonic() < end_s, "an unplugged gamepad ends the remote"
     names = [f"Lever_{side}" for side in ("left_theta", "left_psi", "right_theta", "right_psi")]
@@ -88,16 +85,14 @@ def test_sticks_are_levers_shoulders_are_dead_man_and_button_and_unplugged_is_si
     assert len(wire.sent) == 5
 
 
-def test_a_gamepad_that_is_not_there_is_refused_before_anything_starts(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_a_gamepad_that_is_not_there_is_refused_before_anything_starts(tmp_path: Path) -> None:
     twin = build_twin(option("bus", "udp"), remote=False)
     pad = replace(REMOTE, device=str(tmp_path / "js9"))
     bench = GamepadBench(twin=twin, plant=option("link", "nominal"), gamepad=pad)
     with pytest.raises(
         ConfigError, match=r"bench.gamepad.device=.*js9: No such file.*ls /dev/inp"
     ) as told:
-        bench.companions(machine, None)  # type: ignore[arg-type]
+        bench.companions(MACHINE, None)  # type: ignore[arg-type]
     # Without its device there is no such bench: the way out is another one, and each is shipped.
     others = re.findall(r"bench=(\w+)", str(told.value))
     assert others and set(others) <= set(names("bench")) and "leave" not in str(told.value)

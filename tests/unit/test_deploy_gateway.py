@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from desk import DBC
-from sender import BUS, MACHINE
+from composed import MACHINE
+from sender import BUS, DBC_TEXT, build_other_bus
 
-from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.twin.gateway import LEVERS, NOBODY, PC, Gateway, GatewayState
@@ -119,10 +118,8 @@ def test_only_commands_measure_the_way_there_and_back(around: Around) -> None:
 
 
 def test_a_gateway_of_a_bus_without_stamps_knows_no_delay(tmp_path: Path) -> None:
-    lines = resolve_package_path(DBC).read_text().splitlines()
-    path = tmp_path / "other.dbc"
-    path.write_text("\n".join(line for line in lines if " SG_ Stamp " not in line) + "\n")
-    around = Around(BusDescription(str(path), MACHINE))
+    lines = [line for line in DBC_TEXT.splitlines() if " SG_ Stamp " not in line]
+    around = Around(build_other_bus(tmp_path, "\n".join(lines)))
     around.late_s = dict.fromkeys(around.late_s, 0.6)
     around.get_going()
     assert around.gateway.round_trip_s == 0.0

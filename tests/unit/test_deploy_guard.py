@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from composed import option
+from composed import MACHINE
 from desk import DBC
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -432,7 +432,7 @@ def test_a_direction_is_remembered_through_zero_and_the_first_is_no_change(first
 
 
 def test_numbers_of_the_states_mean_what_the_description_says() -> None:
-    bus = BusDescription(DBC, option("machine", "brokk170"))
+    bus = BusDescription(DBC, MACHINE)
     choices = bus._messages["PcHeartbeat"].get_signal_by_name("PcState").choices
     described = {number: str(name) for number, name in choices.items()}
     assert {one.value: one.name.lower() for one in GuardState} == described

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from desk import DBC
-from sender import BUS, LIMITS, MACHINE, Sender
+from composed import MACHINE
+from sender import BUS, DBC_TEXT, LIMITS, Sender, build_other_bus
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
-from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.checks.envelope import Envelope
@@ -355,11 +354,8 @@ def test_own_commands_that_come_back_are_known(loop: Loop) -> None:
 
 
 def test_a_bus_without_a_heartbeat_gets_none(tmp_path: Any) -> None:
-    text = resolve_package_path(DBC).read_text()
-    text = text.replace("PcHeartbeat", "OtherName")
-    path = tmp_path / "other.dbc"
-    path.write_text(text)
-    loop = Loop(bus=BusDescription(str(path), MACHINE)).get_active()
+    bus = build_other_bus(tmp_path, DBC_TEXT.replace("PcHeartbeat", "OtherName"))
+    loop = Loop(bus=bus).get_active()
     loop.go(0.3)
     assert {name for _, name, _ in loop.sent} == {"ValveCmd"}
 
@@ -619,17 +615,12 @@ def test_a_borehole_that_jumps_counts_once_it_stays(loop: Loop) -> None:
 def test_a_narrower_range_of_a_command_is_kept_and_one_without_zero_is_refused(
     tmp_path: Path,
 ) -> None:
-    text = resolve_package_path(DBC).read_text()
     line = "SG_ Command_q1 : 0|9@1- (0.004,0) [-1|1]"
-    path = tmp_path / "other.dbc"
-    path.write_text(text.replace(line, line.replace("[-1|1]", "[-0.1|0.1]")))
-    bus = BusDescription(str(path), MACHINE)
+    bus = build_other_bus(tmp_path, DBC_TEXT.replace(line, line.replace("[-1|1]", "[-0.1|0.1]")))
     assert bus.identity != BUS.identity
     loop = Loop(bus=bus).get_active()
     loop.go(0.3)
     assert loop.commands()[-1][1]["Command_q1"] == pytest.approx(0.1)
     assert loop.state is GuardState.ACTIVE
-    path = tmp_path / "without_zero.dbc"
-    path.write_text(text.replace(line, line.replace("[-1|1]", "[0.2|1]")))
     with pytest.raises(ConfigError, match="Command_q1"):
-        BusDescription(str(path), MACHINE)
+        build_other_bus(tmp_path, DBC_TEXT.replace(line, line.replace("[-1|1]", "[0.2|1]")))

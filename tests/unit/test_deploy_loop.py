@@ -20,14 +20,13 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from conftest import Note
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine
 from brokk_rl.sim.scene import make_nominal_scenes
 from deploy.bus.can_bus import CanBus
 from deploy.guidance import AXES, LeverDisplay, LeverMap
@@ -94,8 +93,8 @@ def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.M
     assert report["late_max_s"] == pytest.approx(0.12)
 
 
-def test_levers_are_those_of_the_paper(machine: Machine) -> None:
-    levers = LeverMap(machine)
+def test_levers_are_those_of_the_paper() -> None:
+    levers = LeverMap(MACHINE)
     angles, button = levers.levers(np.array([0.1, 0.0, 0.3, 0.4, 0.5]))
     # Left q4, q1; right q3, q5.
     assert angles == pytest.approx([0.35 * 0.4, 0.35 * 0.1, 0.35 * 0.3, 0.35 * 0.5]) and not button
@@ -104,21 +103,19 @@ def test_levers_are_those_of_the_paper(machine: Machine) -> None:
     assert angles == pytest.approx([0.0, 0.0, -0.21, 0.0]) and button
 
 
-def test_hands_that_follow_exactly_give_the_command(machine: Machine) -> None:
-    levers, generator = LeverMap(machine), np.random.default_rng(0)
+def test_hands_that_follow_exactly_give_the_command() -> None:
+    levers, generator = LeverMap(MACHINE), np.random.default_rng(0)
     for alone in (True, False) * 20:
-        command = np.where(machine.is_exclusive == alone, generator.uniform(-1, 1, 5), 0.0)
+        command = np.where(MACHINE.is_exclusive == alone, generator.uniform(-1, 1, 5), 0.0)
         assert levers.command(*levers.levers(command)) == pytest.approx(command)
 
 
-def test_what_is_shown_changes_no_faster_than_a_hand_and_passes_neutral_before_the_button(
-    machine: Machine,
-) -> None:
-    display = LeverDisplay(option("guidance", "machine"), machine)
+def test_what_is_shown_changes_no_faster_than_a_hand_and_passes_neutral_before_the_button() -> None:
+    display = LeverDisplay(option("guidance", "machine"), MACHINE)
     before, shown = np.zeros(4), []
     for u in [np.array([0, 0, 1.0, 0, 0])] * 6 + [np.array([0, 1.0, 0, 0, 0])] * 12:
-        one = display.show(u, machine.period_s)
-        assert np.abs(one.angles_rad - before).max() <= 2.0 * machine.period_s + 1e-12
+        one = display.show(u, MACHINE.period_s)
+        assert np.abs(one.angles_rad - before).max() <= 2.0 * MACHINE.period_s + 1e-12
         before = one.angles_rad
         shown.append((round(one.angles_rad[2], 3), one.button_right))
     assert shown[3] == (0.35, False) and shown[-1] == (0.35, True)
@@ -126,23 +123,21 @@ def test_what_is_shown_changes_no_faster_than_a_hand_and_passes_neutral_before_t
     assert shown[first - 1] == (0.0, False)
 
 
-def test_a_small_command_is_shown_as_neutral(machine: Machine) -> None:
-    display = LeverDisplay(option("guidance", "machine"), machine)
+def test_a_small_command_is_shown_as_neutral() -> None:
+    display = LeverDisplay(option("guidance", "machine"), MACHINE)
     assert not display.show(np.array([0.02, 0, -0.02, 0, 0]), 1.0).angles_rad.any()
 
 
-def test_levers_that_do_not_do_are_refused(machine: Machine) -> None:
+def test_levers_that_do_not_do_are_refused() -> None:
     with pytest.raises(ConfigError, match="no lever for q5"):
-        LeverMap(replace(machine, levers=machine.levers[:-1]))
-    both = tuple(replace(lever, side="left", axis="psi") for lever in machine.levers)
+        LeverMap(replace(MACHINE, levers=MACHINE.levers[:-1]))
+    both = tuple(replace(lever, side="left", axis="psi") for lever in MACHINE.levers)
     with pytest.raises(ConfigError, match="share"):
-        LeverMap(replace(machine, levers=both))
+        LeverMap(replace(MACHINE, levers=both))
     assert len(AXES) == 4
 
 
-def test_commands_that_come_too_seldom_for_the_guard_are_refused_before_anything_starts(
-    machine: Machine,
-) -> None:
+def test_commands_that_come_too_seldom_for_the_guard_are_refused_before_anything_starts() -> None:
     asked = BusAndPolicySettings(
         wire=CanBus(interface="virtual", channel="none", bitrate=None, port=None, hops=None),
         dbc="deploy:dbc/example_gateway.dbc",
@@ -152,9 +147,9 @@ def test_commands_that_come_too_seldom_for_the_guard_are_refused_before_anything
         target=option("target", "given"),
         realtime=False,
     )
-    asked.check_machine(machine)
+    asked.check_machine(MACHINE)
     with pytest.raises(ConfigError, match=r"guard\.request_s: expected more than"):
-        asked.check_machine(replace(machine, period_s=0.1))
+        asked.check_machine(replace(MACHINE, period_s=0.1))
 
 
 @pytest.fixture
@@ -170,8 +165,8 @@ def change(folder: Path, name: str, **values: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | values))
 
 
-def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> None:
-    bundle = PolicyBundle(SHIPPED, machine)
+def test_the_shipped_policy_acts_here_as_where_it_was_made() -> None:
+    bundle = PolicyBundle(SHIPPED, MACHINE)
     policy = Path(__file__).parents[2] / "tasks/policies/borehole_insertion"
     golden = json.loads((policy / "golden.json").read_text())
     found = bundle.command(np.array(golden["observation"], np.float32))
@@ -179,11 +174,11 @@ def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> 
 
 
 @pytest.mark.parametrize("name", ["borehole_insertion", "slanted", "goal_pose"])
-def test_a_policy_is_done_where_its_task_says_so(machine: Machine, copied: Path, name: str) -> None:
+def test_a_policy_is_done_where_its_task_says_so(copied: Path, name: str) -> None:
     task: Any = option("task", name)
     change(copied, "policy.json", stop={"success": task.describe_success()})
-    bundle, generator = PolicyBundle(str(copied), machine), np.random.default_rng(1)
-    pose = Kinematics(machine).pose(torch.tensor(machine.home, dtype=torch.float32)[None])
+    bundle, generator = PolicyBundle(str(copied), MACHINE), np.random.default_rng(1)
+    pose = Kinematics(MACHINE).pose(torch.tensor(MACHINE.home, dtype=torch.float32)[None])
     told, outcomes = None, set()
     for _ in range(200):
         pitch_rad = torch.tensor([math.pi / 2])
@@ -197,24 +192,22 @@ def test_a_policy_is_done_where_its_task_says_so(machine: Machine, copied: Path,
         start = {"target_m": torch.tensor(target_m, dtype=torch.float32)[None]}
         start |= {"target_pitch_rad": pitch_rad, "scene": make_nominal_scenes(1)}
         judged = task.judge(pose.tip_in_base_m, pose.pitch_rad, torch.zeros(1), start)
-        assert bundle.is_done(np.array(machine.home), target_m, told) == bool(judged.reached)
+        assert bundle.is_done(np.array(MACHINE.home), target_m, told) == bool(judged.reached)
         outcomes.add(bool(judged.reached))
     assert outcomes == {True, False}
 
 
-def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
-    machine: Machine, copied: Path
-) -> None:
+def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(copied: Path) -> None:
     others = {
-        "joints": replace(machine, joints=machine.joints[::-1]),
-        "control": replace(machine, num_history=14),
-        "name": replace(machine, name="other"),
+        "joints": replace(MACHINE, joints=MACHINE.joints[::-1]),
+        "control": replace(MACHINE, num_history=14),
+        "name": replace(MACHINE, name="other"),
     }
     for field, other in others.items():
         with pytest.raises(CheckpointError, match=field):
             PolicyBundle(str(copied), other)
     with pytest.raises(CheckpointError, match="control"):
-        PolicyBundle(str(copied), replace(machine, period_s=0.1, num_history=13))
+        PolicyBundle(str(copied), replace(MACHINE, period_s=0.1, num_history=13))
 
 
 @pytest.mark.parametrize(
@@ -241,40 +234,36 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
     ids=str,
 )
 def test_a_contract_that_says_otherwise_is_refused(
-    machine: Machine, copied: Path, values: dict[str, Any], message: str
+    copied: Path, values: dict[str, Any], message: str
 ) -> None:
     change(copied, "policy.json", **values)
     with pytest.raises(CheckpointError, match=message):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
 
 
-def test_a_policy_that_was_told_its_observations_otherwise_is_refused(
-    machine: Machine, copied: Path
-) -> None:
+def test_a_policy_that_was_told_its_observations_otherwise_is_refused(copied: Path) -> None:
     observation = json.loads((copied / "policy.json").read_text())["observation"]
     observation["q"]["std"][0] *= 2
     change(copied, "policy.json", observation=observation)
     with pytest.raises(CheckpointError, match="'q'"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
 
 
-def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(
-    machine: Machine, copied: Path
-) -> None:
+def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(copied: Path) -> None:
     golden = json.loads((copied / "golden.json").read_text())
     golden["command"][3][2] += 0.01
     (copied / "golden.json").write_text(json.dumps(golden))
     with pytest.raises(CheckpointError, match="answers"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
     (copied / "golden.json").unlink()
     with pytest.raises(CheckpointError, match=r"golden\.json is missing"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
     content = (copied / "policy.onnx").read_bytes()
     (copied / "policy.onnx").write_bytes(content[: len(content) // 2])
     with pytest.raises(CheckpointError, match=r"policy\.onnx cannot be read"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
     with pytest.raises(CheckpointError, match=r"policy\.json is missing"):
-        PolicyBundle("nowhere", machine)
+        PolicyBundle("nowhere", MACHINE)
 
 
 def write_network(folder: Path, kind: str) -> None:
@@ -297,13 +286,13 @@ def write_network(folder: Path, kind: str) -> None:
     "kind", ["newer format", "nested metadata", "weights left behind", "weights beside it"]
 )
 def test_networks_of_other_tools_work_or_are_refused(
-    machine: Machine, copied: Path, kind: str, record_property: Note
+    copied: Path, kind: str, record_property: Note
 ) -> None:
     write_network(copied, kind)
     runs = kind == "weights beside it"
     record_property(f"files: network with {kind}; answer", "runs" if runs else "refused")
     with nullcontext() if runs else pytest.raises(CheckpointError, match=r"policy\.onnx"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
 
 
 KINDS = ("pipe", "device", "folder", "huge", "nested", "wide", "list", "{}", "7")
@@ -313,7 +302,7 @@ NO_FILES += [("golden.json", "wide"), ("golden.json", "pipe"), ("policy.onnx", "
 
 @pytest.mark.parametrize(("name", "kind"), NO_FILES)
 def test_what_is_no_file_of_a_policy_is_refused_at_once(
-    machine: Machine, copied: Path, name: str, kind: str, record_property: Note
+    copied: Path, name: str, kind: str, record_property: Note
 ) -> None:
     path, begun_s = copied / name, time.monotonic()
     path.unlink()
@@ -330,7 +319,7 @@ def test_what_is_no_file_of_a_policy_is_refused_at_once(
         wide = '{"observation": [' + "[]," * 3_000_000 + "[]]}"
         path.write_text({"nested": "[" * 100_000, "wide": wide, "list": "[1, 2]"}.get(kind, kind))
     with pytest.raises(CheckpointError, match=f"{re.escape(name)}|the contract"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
     refused_s = time.monotonic() - begun_s
     assert refused_s < 2.0
     record_property(f"files: {kind} in place of a policy's file; refused, s", round(refused_s, 2))
@@ -345,12 +334,12 @@ def test_what_is_no_file_of_a_policy_is_refused_at_once(
     ],
 )
 def test_golden_answers_that_are_none_are_refused(
-    machine: Machine, copied: Path, golden: dict[str, Any], record_property: Note
+    copied: Path, golden: dict[str, Any], record_property: Note
 ) -> None:
     record_property("files: golden answers that are none; answer", "refused")
     (copied / "golden.json").write_text(json.dumps(golden))
     with pytest.raises(CheckpointError, match=r"golden\.json"):
-        PolicyBundle(str(copied), machine)
+        PolicyBundle(str(copied), MACHINE)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "nested", "large", "endless number"])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from motion import build_nominal_tables
 
 from brokk_rl.errors import ConfigError
@@ -21,7 +21,6 @@ from deploy.checks.valve_model import ValvePredictor, load_observer_file
 from deploy.guard_setup import read_observer_content
 from deploy.kernel.guard import NOTHING_OBSERVED, GuardTrip
 
-MACHINE = option("machine", "brokk170")
 SHIPPED = Path(__file__).parents[2] / "deploy" / "observers" / "brokk170.json"
 SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
 PERIOD_S = MACHINE.period_s

@@ -12,11 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from composed import option
+from composed import MACHINE, option
 from conftest import Note
 from desk import NO_VCAN, VCAN, Desk
 
-from brokk_rl.machine import Machine
 from deploy.kernel.guard import GuardState
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -33,13 +32,13 @@ BUSES = [
 
 @pytest.fixture(scope="module", params=BUSES)
 def desk(
-    machine: Machine, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 ) -> Iterator[Desk]:
     with pytest.MonkeyPatch.context() as patch:
         folders = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(folders))
         limits, folder = option("guard", "default"), tmp_path_factory.mktemp("desk")
-        with Desk(machine, limits, folder, kind=request.param) as made:
+        with Desk(MACHINE, limits, folder, kind=request.param) as made:
             for name in ("twin", "bus", "page", "commander"):
                 made.start(name)
             made.wait_for_state()

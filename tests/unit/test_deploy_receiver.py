@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from desk import DBC
-from sender import BUS, DECISION, HOME, MACHINE, PERIODS_S, Sender
+from composed import MACHINE
+from sender import BUS, DBC_TEXT, DECISION, HOME, PERIODS_S, Sender, build_other_bus
 
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
@@ -298,15 +298,8 @@ def test_the_state_is_a_copy(sender: Sender) -> None:
 
 def _build_bus(tmp_path: Any, *lines: str) -> BusDescription:
     """Return the example bus without the signals that stand in `lines`."""
-    from brokk_rl.registry import resolve_package_path
-
-    kept = []
-    for line in resolve_package_path(DBC).read_text().splitlines():
-        if not any(one in line for one in lines):
-            kept.append(line)
-    path = tmp_path / "other.dbc"
-    path.write_text("\n".join(kept) + "\n")
-    return BusDescription(str(path), MACHINE)
+    kept = [text for text in DBC_TEXT.splitlines() if not any(line in text for line in lines)]
+    return build_other_bus(tmp_path, "\n".join(kept))
 
 
 def test_a_bus_without_stamps_counts_ages_from_arrival(tmp_path: Any) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from composed import MACHINE
 from conftest import Brokk, Note
 from desk import DBC
 from mcap.reader import make_reader
@@ -19,7 +20,6 @@ from mcap.records import Chunk
 
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.recorder import capture_reader
@@ -32,15 +32,14 @@ READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
 
 def write(
     folder: Path,
-    machine: Machine,
     seconds: float = 3.0,
     gap_s: float = 0.0,
     close: bool = True,
     advice_until_s: float = np.inf,
 ) -> CaptureWriter:
     """Writes a capture of a machine whose first joint follows a known path: q1 = 0.1 t, flow a step of 0.5 at 1.025 s."""
-    bus = BusDescription(DBC, machine)
-    log = CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 0.0))
+    bus = BusDescription(DBC, MACHINE)
+    log = CaptureWriter(CaptureConfig(folder, DBC, MACHINE, {"source": "test"}, 0.0))
     begun_s, counter = time.monotonic(), 0
     for k in range(round(seconds * 100)):
         t_s = k * 0.01
@@ -73,11 +72,11 @@ def write(
     return log
 
 
-def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_path: Path) -> None:
-    write(tmp_path, machine)
-    (found,) = READER.read(tmp_path / MCAP, machine)
+def test_a_capture_becomes_the_recording_of_what_happened(tmp_path: Path) -> None:
+    write(tmp_path)
+    (found,) = READER.read(tmp_path / MCAP, MACHINE)
     record.write_recording(found, tmp_path / "x.parquet")
-    again = record.read_recording(tmp_path / "x.parquet", machine)
+    again = record.read_recording(tmp_path / "x.parquet", MACHINE)
     assert again.rate_hz == 20.0 and again.num_samples == pytest.approx(59, abs=2)
     assert again.q[:, 0] == pytest.approx(0.1 * again.t_s, abs=1e-3)
     step = int(np.flatnonzero(again.u[:, 0] > 0)[0])
@@ -90,11 +89,9 @@ def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_
     assert again.metadata["source"] == "capture: test"
 
 
-def test_rows_lie_on_the_decisions_and_hold_what_the_policy_saw(
-    machine: Machine, tmp_path: Path
-) -> None:
-    write(tmp_path, machine)
-    (found,) = READER.read(tmp_path / MCAP, machine)
+def test_rows_lie_on_the_decisions_and_hold_what_the_policy_saw(tmp_path: Path) -> None:
+    write(tmp_path)
+    (found,) = READER.read(tmp_path / MCAP, MACHINE)
     assert found.extra["target_x_m"][20] == pytest.approx(2.6)
     assert np.isnan(found.extra["target_x_m"][5])
     seen_s = found.extra["obs_0"][15:40]
@@ -103,26 +100,24 @@ def test_rows_lie_on_the_decisions_and_hold_what_the_policy_saw(
     assert found.extra["obs_1"][20] == 2.0
 
 
-def test_after_its_last_decision_a_policy_sees_nothing(machine: Machine, tmp_path: Path) -> None:
-    write(tmp_path, machine, advice_until_s=2.0)
-    (found,) = READER.read(tmp_path / MCAP, machine)
+def test_after_its_last_decision_a_policy_sees_nothing(tmp_path: Path) -> None:
+    write(tmp_path, advice_until_s=2.0)
+    (found,) = READER.read(tmp_path / MCAP, MACHINE)
     seen = np.isfinite(found.extra["obs_0"])
     assert seen[15:38].all() and not seen[42:].any() and found.num_samples > 50
     assert np.isfinite(found.extra["advice_q1"][42:]).all(), "advice stays in force until withdrawn"
 
 
-def test_a_gap_splits_the_recording(machine: Machine, tmp_path: Path) -> None:
-    write(tmp_path, machine, seconds=4.0, gap_s=0.4)
-    first, second = READER.read(tmp_path / MCAP, machine)
+def test_a_gap_splits_the_recording(tmp_path: Path) -> None:
+    write(tmp_path, seconds=4.0, gap_s=0.4)
+    first, second = READER.read(tmp_path / MCAP, MACHINE)
     assert first.duration_s == pytest.approx(1.4, abs=0.15)
     assert second.duration_s == pytest.approx(2.0, abs=0.15)
     assert first.metadata["run"] == second.metadata["run"]
 
 
-def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
-    machine: Machine, tmp_path: Path
-) -> None:
-    log = write(tmp_path, machine, close=False)  # never closed, as after SIGKILL
+def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(tmp_path: Path) -> None:
+    log = write(tmp_path, close=False)  # never closed, as after SIGKILL
     contents = capture_reader.read_capture(tmp_path / MCAP)
     positions = contents.messages["JointPos1"]
     # Flushed last at 2.5 s.
@@ -131,10 +126,8 @@ def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
 
 
 @pytest.mark.parametrize("part", [0.5, 0.7, 0.9, 0.999])
-def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
-    machine: Machine, tmp_path: Path, part: float
-) -> None:
-    write(tmp_path, machine, seconds=6.0)
+def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(tmp_path: Path, part: float) -> None:
+    write(tmp_path, seconds=6.0)
     whole = len(capture_reader.read_capture(tmp_path / MCAP).messages["JointPos1"])
     content = (tmp_path / MCAP).read_bytes()
     (tmp_path / f"cut_{MCAP}").write_bytes(content[: int(part * len(content))])
@@ -145,9 +138,9 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
 
 
 def test_a_wrong_byte_anywhere_costs_at_most_its_chunk(
-    machine: Machine, tmp_path: Path, brokk: Brokk, record_property: Note
+    tmp_path: Path, brokk: Brokk, record_property: Note
 ) -> None:
-    write(tmp_path, machine, seconds=6.0)
+    write(tmp_path, seconds=6.0)
     path, draw = tmp_path / MCAP, random.Random(5)
     content = path.read_bytes()
     whole = capture_reader.read_capture(path)
@@ -213,9 +206,9 @@ def test_a_pipe_is_no_capture(tmp_path: Path) -> None:
         capture_reader.read_capture(tmp_path / MCAP)
 
 
-def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: Path) -> None:
-    bus = BusDescription(DBC, machine)
-    with CaptureWriter(CaptureConfig(tmp_path, DBC, machine, {}, 0.0)) as log:
+def test_frames_that_were_refused_are_kept_and_said(tmp_path: Path) -> None:
+    bus = BusDescription(DBC, MACHINE)
+    with CaptureWriter(CaptureConfig(tmp_path, DBC, MACHINE, {}, 0.0)) as log:
         payload = bytearray(bus.encode("JointPos1", {}, 1))
         payload[0] ^= 1
         head = FRAME.pack(time.monotonic(), bus.layouts["JointPos1"].frame_id, 0, 8)
@@ -225,11 +218,11 @@ def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: 
 
 
 def test_a_step_of_the_wall_clock_shows_nowhere(
-    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, shift_ns = time.time_ns, 0
     monkeypatch.setattr("time.time_ns", lambda: real() + shift_ns)
-    with CaptureWriter(CaptureConfig(tmp_path, DBC, machine, {}, 0.0)) as log:
+    with CaptureWriter(CaptureConfig(tmp_path, DBC, MACHINE, {}, 0.0)) as log:
         for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # noqa: B007
             advice = {"topic": "advice", "t_s": time.monotonic(), "reason": "valid", "u": [0.0] * 5}
             log.add(TEXT + json.dumps(advice).encode())
@@ -238,24 +231,22 @@ def test_a_step_of_the_wall_clock_shows_nowhere(
     assert len(times) == 3 and 0 <= times[2] - times[0] < 5 * 10**9
 
 
-def test_a_capture_of_another_machine_or_of_nothing_is_refused(
-    machine: Machine, tmp_path: Path
-) -> None:
-    write(tmp_path, machine, seconds=1.5)
+def test_a_capture_of_another_machine_or_of_nothing_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, seconds=1.5)
     with pytest.raises(RecordingError, match="another machine"):
-        READER.read(tmp_path / MCAP, replace(machine, name="other"))
+        READER.read(tmp_path / MCAP, replace(MACHINE, name="other"))
     with pytest.raises(RecordingError, match="no piece"):
-        replace(READER, shortest_s=10.0).read(tmp_path / MCAP, machine)
+        replace(READER, shortest_s=10.0).read(tmp_path / MCAP, MACHINE)
     facts = {"fingerprint": "[" * 100_000}
-    with CaptureWriter(CaptureConfig(tmp_path / "nested", DBC, machine, facts, 0.0)):
+    with CaptureWriter(CaptureConfig(tmp_path / "nested", DBC, MACHINE, facts, 0.0)):
         pass
     with pytest.raises(RecordingError, match="nested too deeply"):
-        READER.read(tmp_path / "nested" / MCAP, machine)
+        READER.read(tmp_path / "nested" / MCAP, MACHINE)
     (tmp_path / "empty.mcap").write_bytes(b"")
     with pytest.raises(RecordingError, match="cut off"):
-        READER.read(tmp_path / "empty.mcap", machine)
+        READER.read(tmp_path / "empty.mcap", MACHINE)
     with pytest.raises(RecordingError, match="no such"):
-        READER.read(tmp_path / "none.mcap", machine)
+        READER.read(tmp_path / "none.mcap", MACHINE)
 
 
 def test_messages_of_numbers_are_kept_by_column_and_others_as_they_are() -> None:

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from block import BLOCK_M, TARGETS, take_frame
-from composed import option
+from composed import MACHINE, option
 from desk import DBC
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
-from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.page.replay import ReplayFeed
@@ -56,10 +55,10 @@ HOLES = [
 
 
 @pytest.fixture(scope="module")
-def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of one second with every topic, and two pictures where viewers' messages are written."""
-    folder, bus = tmp_path_factory.mktemp("capture"), BusDescription(DBC, machine)
-    with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 1.0)) as log:
+    folder, bus = tmp_path_factory.mktemp("capture"), BusDescription(DBC, MACHINE)
+    with CaptureWriter(CaptureConfig(folder, DBC, MACHINE, {"source": "test"}, 1.0)) as log:
 
         def say(topic: str, t_s: float, values: dict[str, Any]) -> None:
             log.add(TEXT + json.dumps({"topic": topic, "t_s": t_s, **values}).encode())
@@ -140,11 +139,11 @@ def test_points_lie_where_the_depths_say(found: dict[str, list[Any]]) -> None:
     assert found["camera/calibration"][0].width == 160
 
 
-def test_the_replay_shows_the_pictures_again(folder: Path, machine: Machine) -> None:
+def test_the_replay_shows_the_pictures_again(folder: Path) -> None:
     now = [0.0]
     replay = option("feed", "replay", capture=folder)
     views = ("camera", "camera/calibration", "camera/points", "tf/camera")
-    feed = ReplayFeed(replay, machine, read_capture(folder / MCAP, views), lambda: now[0])
+    feed = ReplayFeed(replay, MACHINE, read_capture(folder / MCAP, views), lambda: now[0])
     assert feed.read_frame(-1.0) is None, "nothing was taken yet"
     taken = take_frame((160, 90), 1, 0.0)
     now[0] = 0.9
@@ -170,7 +169,7 @@ def rotation(quaternion: Any) -> np.ndarray:
 def test_the_shipped_layout_names_topics_and_fields_that_exist(folder: Path) -> None:
     text = (resources.files("deploy") / "recorder" / "foxglove_layout.json").read_text()
     layout = json.loads(text)
-    bus = BusDescription(DBC, option("machine", "brokk170"))
+    bus = BusDescription(DBC, MACHINE)
     fields = {topic: {one.name for one in own} for topic, own in TOPICS.items()}
     fields |= {layout.name: set(bus.units(layout.name)) for layout in bus.layouts.values()}
     paths = [

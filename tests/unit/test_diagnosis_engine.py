@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from composed import MACHINE
 from conftest import Brokk
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
 from diagnosis.closure import Gate, RivalError
 from diagnosis.engine import decide
@@ -24,10 +24,10 @@ from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
 
 
-def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) -> None:
+def test_a_case_without_its_half_is_refused(tmp_path: Path) -> None:
     (tmp_path / "field").mkdir()
     with pytest.raises(RecordingError, match=r"no reference/.*diagnosis.field"):
-        case.load_case(tmp_path, machine)
+        case.load_case(tmp_path, MACHINE)
 
 
 PLACE = {"rmse_rad": 0.03, "floor_rad": 0.002, "after_rad": 0.004, "share": 1.0}
@@ -71,23 +71,21 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
         answer.read_answer(path)
 
 
-def test_rivals_share_what_the_first_name_leaves(machine: Machine) -> None:
+def test_rivals_share_what_the_first_name_leaves() -> None:
     # Of one name in two forms the better one counts.
     earned = (("backlash", 90.0), ("lag", 60.0), ("stiction", 45.0), ("lag", 44.0), ("creep", -1.0))
     rivals = [decide.EffectFinding(name, {2: nats}) for name, nats in earned]
-    found = rank_effects(said().selected, rivals, "effects", machine)
+    found = rank_effects(said().selected, rivals, "effects", MACHINE)
     # Of 0.03, as e to 1, since 15 nats lie between them.
     shares = {"backlash": 0.97, "lag": 0.03 / (1 + np.exp(-1)), "stiction": 0.03 / (1 + np.e)}
     assert {one.effect: one.probability for one in found} == pytest.approx(shares)
     assert [one.effect for one in found] == list(shares)
-    assert [one.effect for one in rank_effects((), (), "none", machine)] == ["none"]
+    assert [one.effect for one in rank_effects((), (), "none", MACHINE)] == ["none"]
 
 
-def test_training_takes_the_found_effects_as_they_are(
-    tmp_path: Path, machine: Machine, brokk: Brokk
-) -> None:
+def test_training_takes_the_found_effects_as_they_are(tmp_path: Path, brokk: Brokk) -> None:
     path = tmp_path / effects_file.EFFECTS_FILE
-    effects_file.write_effects(said(), effect_library.load_effects(machine), path)
+    effects_file.write_effects(said(), effect_library.load_effects(MACHINE), path)
     done = brokk("mode=train", f"effect=@{path}", "--cfg", "job")
     text = done.out[done.out.index("backlash:") :]
     assert "q3: 0.031" in text and "other: 0.0" in text

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from composed import MACHINE
 from conftest import Brokk
 from gaps import recording
 
 from brokk_rl import record
-from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 
@@ -34,9 +34,9 @@ def given(folder: Path, *recordings: Recording) -> str:
     ],
 )  # fmt: skip
 def test_recordings_that_can_tell_nothing_get_no_name_but_a_reason(
-    machine: Machine, brokk: Brokk, tmp_path: Path, change: Callable, count: int, reason: str
+    brokk: Brokk, tmp_path: Path, change: Callable, count: int, reason: str
 ) -> None:
-    field = given(tmp_path / "field", *[change(recording(machine))] * count)
+    field = given(tmp_path / "field", *[change(recording(MACHINE))] * count)
     brokk("mode=diagnose", field, "actuator=lag", "session.out=out", "session.device=cpu")
     found = json.loads(Path("out/diagnosis.json").read_text())
     assert found["verdict"] == "unknown" and not found["selected"] and found["gap"] is None
@@ -46,23 +46,19 @@ def test_recordings_that_can_tell_nothing_get_no_name_but_a_reason(
     assert all(line.startswith("#") for line in lines if line)  # nothing that training would take
 
 
-def test_neither_a_simulator_nor_a_reference_is_refused(
-    machine: Machine, brokk: Brokk, tmp_path: Path
-) -> None:
-    field = given(tmp_path / "field", recording(machine))
+def test_neither_a_simulator_nor_a_reference_is_refused(brokk: Brokk, tmp_path: Path) -> None:
+    field = given(tmp_path / "field", recording(MACHINE))
     case = f"diagnosis.case={tmp_path}"
     for word, told in ((field, "add actuator=<name>"), (case, "no reference/*.parquet")):
         done = brokk("mode=diagnose", word, "session.out=out", code=2)
         assert told in done.err
 
 
-def test_recordings_of_another_machine_are_refused_by_name(
-    machine: Machine, brokk: Brokk, tmp_path: Path
-) -> None:
-    stretched = replace(machine.joints[2], upper=replace(machine.joints[2].upper, value=2.5))
-    other = replace(machine, joints=(*machine.joints[:2], stretched, *machine.joints[3:]))
+def test_recordings_of_another_machine_are_refused_by_name(brokk: Brokk, tmp_path: Path) -> None:
+    stretched = replace(MACHINE.joints[2], upper=replace(MACHINE.joints[2].upper, value=2.5))
+    other = replace(MACHINE, joints=(*MACHINE.joints[:2], stretched, *MACHINE.joints[3:]))
     stamp = {"fingerprint": record.format_fingerprint(other)}
-    stamped = replace(recording(machine), metadata=stamp)
+    stamped = replace(recording(MACHINE), metadata=stamp)
     words = ("mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag")
     done = brokk(*words, "session.out=out", code=2)
     assert "limits differ" in done.err and "0.parquet" in done.err
@@ -70,12 +66,10 @@ def test_recordings_of_another_machine_are_refused_by_name(
     assert "brokk170" in done.err
 
 
-def test_a_position_that_is_no_number_is_refused_by_name(
-    machine: Machine, brokk: Brokk, tmp_path: Path
-) -> None:
+def test_a_position_that_is_no_number_is_refused_by_name(brokk: Brokk, tmp_path: Path) -> None:
     import pyarrow.parquet as pq
 
-    given(tmp_path / "field", recording(machine), recording(machine))
+    given(tmp_path / "field", recording(MACHINE), recording(MACHINE))
     path = tmp_path / "field" / "1.parquet"
     table = pq.read_table(path)
     place = table.column_names.index("q_q3_rad")

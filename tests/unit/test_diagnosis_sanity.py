@@ -7,39 +7,39 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from composed import MACHINE
 from gaps import DELAY, recording
 
 from actuators.recordings.recording_checks import REMARKS, RecordingRemark, examine_recordings
-from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 Examine = Callable[[Recording], dict[str, RecordingRemark]]
 
 
 @pytest.fixture
-def sound(machine: Machine) -> Recording:
-    return recording(machine)
+def sound() -> Recording:
+    return recording(MACHINE)
 
 
 @pytest.fixture
-def examine(machine: Machine) -> Examine:
+def examine() -> Examine:
     """Returns the remarks on a recording by name."""
 
     def run(one: Recording) -> dict[str, RecordingRemark]:
-        return {found.name: found for found in examine_recordings([one], machine)}
+        return {found.name: found for found in examine_recordings([one], MACHINE)}
 
     return run
 
 
-def test_a_sound_recording_says_only_which_joint_rested(sound: Recording, machine: Machine) -> None:
-    (remark,) = examine_recordings([sound], machine)
+def test_a_sound_recording_says_only_which_joint_rested(sound: Recording) -> None:
+    (remark,) = examine_recordings([sound], MACHINE)
     assert (remark.name, remark.joint, remark.kind.severity) == ("joint at rest", "q2", "note")
 
 
 def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
-    sound: Recording, machine: Machine, examine: Examine
+    sound: Recording, examine: Examine
 ) -> None:
-    found = examine(recording(machine, np.abs(sound.u[:, 3]) > 0))["interlock"]
+    found = examine(recording(MACHINE, np.abs(sound.u[:, 3]) > 0))["interlock"]
     assert found.joint == "q3"
     assert found.kind.severity == "bad"
     assert found.recording == "planted"
@@ -48,20 +48,18 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
 
 
 def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
-    sound: Recording, machine: Machine, examine: Examine
+    sound: Recording, examine: Examine
 ) -> None:
     limit = float(np.quantile(sound.q[:, 0], 0.5))
-    found = examine(recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY)))["interlock"]
+    found = examine(recording(MACHINE, np.roll(sound.q[:, 0] > limit, -DELAY)))["interlock"]
     assert found.joint == "q3" and "q3 ignores its command when q1 is above" in found.amount
 
 
-def test_a_lock_without_a_common_condition_stays_unexplained(
-    machine: Machine, examine: Examine
-) -> None:
+def test_a_lock_without_a_common_condition_stays_unexplained(examine: Examine) -> None:
     ignored = np.zeros(4800, dtype=bool)
     for begin in np.random.default_rng(3).integers(0, 4700, 12):
         ignored[begin : begin + 60] = True
-    found = examine(recording(machine, ignored))
+    found = examine(recording(MACHINE, ignored))
     assert "interlock" not in found and found["command without motion"].joint == "q3"
     assert "s in all" in found["command without motion"].amount
 
@@ -81,7 +79,7 @@ def test_only_rows_that_are_not_equally_spaced_are_a_fault_of_the_clock(
 
 
 def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(
-    sound: Recording, machine: Machine, examine: Examine
+    sound: Recording, examine: Examine
 ) -> None:
     middle = float(sound.q[:, 2].min() + 0.7 * np.ptp(sound.q[:, 2]))
     q = sound.q.copy()
@@ -89,13 +87,13 @@ def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_no
     found = examine(replace(sound, q=q))["saturated sensor"]
     assert found.joint == "q3" and found.kind.severity == "bad"
     shifted = q.copy()
-    shifted[:, 2] += machine.upper[2] - q[:, 2].max()
+    shifted[:, 2] += MACHINE.upper[2] - q[:, 2].max()
     assert "saturated sensor" not in examine(replace(sound, q=shifted))
 
 
-def test_the_gravest_comes_first_and_all_of_it_is_plain(sound: Recording, machine: Machine) -> None:
-    slow = replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)
-    remarks = examine_recordings([slow], machine)
+def test_the_gravest_comes_first_and_all_of_it_is_plain(sound: Recording) -> None:
+    slow = replace(recording(MACHINE, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)
+    remarks = examine_recordings([slow], MACHINE)
     places = [["bad", "warn", "note"].index(remark.kind.severity) for remark in remarks]
     assert places == sorted(places)
     for remark in remarks:

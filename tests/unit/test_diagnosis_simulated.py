@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from composed import MACHINE
 from gaps import diagnose
 from motion import make_recording
 from scipy.signal import lsim
@@ -41,10 +42,8 @@ from diagnosis.repair_proof import EngineProof
 RATE_HZ = 20.0
 
 
-@pytest.fixture(scope="module")
-def two_joints(machine: Machine) -> Machine:
-    """A machine of two arms."""
-    return replace(machine, joints=machine.joints[2:4], exclusive=(), levers=(), name="two")
+TWO_JOINTS = replace(MACHINE, joints=MACHINE.joints[2:4], exclusive=(), levers=(), name="two")
+"""A machine of two arms."""
 
 
 def make_commands(seconds: float, seed: int) -> np.ndarray:
@@ -98,9 +97,9 @@ def make_case(
     return GapCase(machine, reference, field)
 
 
-def make_side(machine: Machine, u: np.ndarray) -> Side:
+def make_side(u: np.ndarray) -> Side:
     """Return a side with these commands and no motion."""
-    return stack_side([record(machine, u, np.zeros_like(u))], machine)
+    return stack_side([record(TWO_JOINTS, u, np.zeros_like(u))], TWO_JOINTS)
 
 
 def pure_numbers(**values: float) -> np.ndarray:
@@ -119,9 +118,9 @@ RINGING = {"ringing_s": 2.0 * np.pi, "damping": 0.2}
 @pytest.mark.parametrize(
     ("numbers", "system"), [({"speed_lag_s": 0.4}, LAG_SYSTEM), (RINGING, RINGING_SYSTEM)]
 )
-def test_a_late_joint_is_that_of_scipy(two_joints: Machine, numbers: Any, system: Any) -> None:
+def test_a_late_joint_is_that_of_scipy(numbers: Any, system: Any) -> None:
     u = make_commands(20.0, 0)
-    path = make_side(two_joints, u).simulate(0, pure_numbers(delay_s=0.3, **numbers))[0]
+    path = make_side(u).simulate(0, pure_numbers(delay_s=0.3, **numbers))[0]
     # SciPy integrates path' = v under commands held over each period.
     fine = 10
     t = np.arange(len(u) * fine) / (RATE_HZ * fine)
@@ -133,16 +132,16 @@ def test_a_late_joint_is_that_of_scipy(two_joints: Machine, numbers: Any, system
 
 
 @pytest.mark.parametrize("level", [1.0, 0.25])
-def test_an_orifice_delays_by_the_root_of_the_command(two_joints: Machine, level: float) -> None:
+def test_an_orifice_delays_by_the_root_of_the_command(level: float) -> None:
     """A chamber with p' = sqrt(u - p) / T follows a step to u with a mean delay of 2/3 T sqrt(u)."""
-    side = make_side(two_joints, np.repeat([[0.0, 0.0], [level, level]], [20, 80], 0))
+    side = make_side(np.repeat([[0.0, 0.0], [level, level]], [20, 80], 0))
     paths = side.simulate(0, np.stack([pure_numbers(), pure_numbers(filling_s=0.4)]))
     assert (paths[0, -1] - paths[1, -1]) / level == pytest.approx(0.4 * level**0.5, abs=0.02)
 
 
-def test_a_delay_acts_by_each_part_of_a_step(two_joints: Machine) -> None:
+def test_a_delay_acts_by_each_part_of_a_step() -> None:
     """At a steady speed v, each further 5 ms cost 5 ms v; a step of the simulation lasts 25 ms."""
-    side = make_side(two_joints, np.repeat([[0.0, 0.0], [0.6, 0.6]], [20, 80], 0))
+    side = make_side(np.repeat([[0.0, 0.0], [0.6, 0.6]], [20, 80], 0))
     delays_s = 0.3 + 0.005 * np.arange(11)
     numbers = np.repeat(VALVE.list_values("mean")[None], len(delays_s), 0)
     numbers[:, VALVE.place["delay_s"]] = delays_s
@@ -152,10 +151,10 @@ def test_a_delay_acts_by_each_part_of_a_step(two_joints: Machine) -> None:
     assert paths[:, -1] == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Machine) -> None:
+def test_a_joint_moves_faster_or_slower_while_another_one_is_open() -> None:
     u = np.full((300, 2), 0.5)
     u[:, 1] = np.repeat([0.0, 0.5, -0.5], 100)
-    side = make_side(two_joints, u)
+    side = make_side(u)
     numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1)
     side.ask_others([numbers, pure_numbers()])
     path = side.simulate(0, numbers)[0]
@@ -164,7 +163,7 @@ def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Ma
     assert ways == pytest.approx([1.5, 1.8, 1.35], rel=0.01)
 
 
-def test_a_joint_waits_until_the_pump_bears_its_load(two_joints: Machine) -> None:
+def test_a_joint_waits_until_the_pump_bears_its_load() -> None:
     """A pump with a lag of 0.2 s, worked by hand for a load of twice its margin.
 
     It rises to 3 margins as 3 (1 - exp(-t / 0.2 s)). Behind 2 margins the speed grows with the rest of the pressure
@@ -172,7 +171,7 @@ def test_a_joint_waits_until_the_pump_bears_its_load(two_joints: Machine) -> Non
     0.3187 s. Without a load the pressure rises to 1 margin from 0 on, and 0.0989 s are lost. A step of the
     model, 25 ms, has the pressure of its end all along, so that one step less is lost.
     """
-    side = make_side(two_joints, np.repeat([[0.0, 0.0], [1.0, 0.0]], [40, 120], 0))
+    side = make_side(np.repeat([[0.0, 0.0], [1.0, 0.0]], [40, 120], 0))
     heavy = pure_numbers(pump_lag_s=0.2, pump_weight=2.0)
     none = side.simulate(0, pure_numbers())[0, -1]
     for load, lost_s in ((-1.0, 0.3187), (1.0, 0.0989), (0.0, 0.0989)):
@@ -181,11 +180,11 @@ def test_a_joint_waits_until_the_pump_bears_its_load(two_joints: Machine) -> Non
         assert lost == pytest.approx(lost_s - 0.025, abs=0.0125)
 
 
-def test_a_pump_that_was_always_small_and_slow_to_start_is_found(two_joints: Machine) -> None:
+def test_a_pump_that_was_always_small_and_slow_to_start_is_found() -> None:
     places = [VALVE.place[name] for name in ("pump_load", "pump_lag_s", "pump_weight")]
     numbers = VALVE.list_values("mean")
     numbers[places] = [0.8, 0.4, 2.0]
-    side = make_side(two_joints, np.clip(2.0 * make_commands(120.0, 3), -1.0, 1.0))
+    side = make_side(np.clip(2.0 * make_commands(120.0, 3), -1.0, 1.0))
     side = replace(side, loads=np.full_like(side.loads, -0.25))
     side.ask_others([numbers, numbers])
     side.q = np.stack([side.simulate(j, numbers)[0] for j in (0, 1)], 1).astype(float)
@@ -193,11 +192,9 @@ def test_a_pump_that_was_always_small_and_slow_to_start_is_found(two_joints: Mac
         assert one.numbers[places] == pytest.approx([0.8, 0.4, 2.0], rel=0.1)
 
 
-def test_numbers_without_a_part_are_no_step_too_far(
-    two_joints: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numbers_without_a_part_are_no_step_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
     """Slopes far too small, as where friction lets go, make steps far too long."""
-    side = stack_side(make_case(two_joints).reference, two_joints)
+    side = stack_side(make_case(TWO_JOINTS).reference, TWO_JOINTS)
     told = [one.spread for one in fit_reference(side)]
 
     def flatten(*given: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -235,11 +232,9 @@ def test_the_variance_of_increments_is_that_of_what_was_drawn() -> None:
 
 
 @pytest.mark.parametrize(("number", "lowering"), [("load_both", 1.0), ("load_opposing", 0.0)])
-def test_dependence_on_weight_is_told_per_yield_force(
-    machine: Machine, number: str, lowering: float
-) -> None:
-    found = sizes.translate(Row("load_dependence", ((number, "add", 0.05),)), 1, machine)
-    share = 9.81 * measure_full_loads(machine)[1] / machine.bodies[1].yield_force.value
+def test_dependence_on_weight_is_told_per_yield_force(number: str, lowering: float) -> None:
+    found = sizes.translate(Row("load_dependence", ((number, "add", 0.05),)), 1, MACHINE)
+    share = 9.81 * measure_full_loads(MACHINE)[1] / MACHINE.bodies[1].yield_force.value
     assert found == pytest.approx({"sensitivity": 2 * 0.05 / share, "lowering": lowering}, rel=1e-3)
 
 
@@ -279,7 +274,7 @@ def test_mean_courses_are_those_of_all_paths(law: HoldLaw, power: float) -> None
     assert course.cost == pytest.approx(rel_entr(posterior, prior).sum())
 
 
-def test_losses_are_fitted_where_a_third_of_the_samples_tells_them(machine: Machine) -> None:
+def test_losses_are_fitted_where_a_third_of_the_samples_tells_them() -> None:
     generator = np.random.default_rng(3)
     delays = [0]
     for chance in generator.uniform(size=40_000):
@@ -290,14 +285,14 @@ def test_losses_are_fitted_where_a_third_of_the_samples_tells_them(machine: Mach
     assert law.probability == pytest.approx(0.1, abs=0.01)
     assert law.persistence == pytest.approx(0.7, abs=0.03)
     held = holds.HeldCourse(law, 1.0, np.array(delays), (1.0,), 0.0, np.array([0.01] * 100))
-    (kind,) = effect_library.load_effects(machine, ("frame_loss",))
-    assert sizes.describe_numbers(kind, {}, held, machine)["persistence"]["q1"].ci95[1] == 1.0
+    (kind,) = effect_library.load_effects(MACHINE, ("frame_loss",))
+    assert sizes.describe_numbers(kind, {}, held, MACHINE)["persistence"]["q1"].ci95[1] == 1.0
     late = replace(held, law=JitterLaw(0.1), delays=np.full(100, 1.6))
-    assert sizes.describe_hold(late, machine)["jitter_s"][0] == pytest.approx(2.0 * 1.6 * 0.05)
+    assert sizes.describe_hold(late, MACHINE)["jitter_s"][0] == pytest.approx(2.0 * 1.6 * 0.05)
 
 
-def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
-    answer = diagnose(make_case(two_joints))
+def test_an_unchanged_machine_has_no_effect() -> None:
+    answer = diagnose(make_case(TWO_JOINTS))
     assert answer.verdict == "none"
 
 
@@ -310,9 +305,9 @@ def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
     ],
 )
 def test_a_changed_joint_is_named_sized_and_proven(
-    two_joints: Machine, changes: Any, effect: str, joints: Any, number: str, size: float
+    changes: Any, effect: str, joints: Any, number: str, size: float
 ) -> None:
-    answer = diagnose(make_case(two_joints, **changes))
+    answer = diagnose(make_case(TWO_JOINTS, **changes))
     assert [(one.effect, one.joints) for one in answer.selected] == [(effect, joints)]
     estimate = answer.selected[0].parameters[number]["q4"]
     assert estimate.mean == pytest.approx(size, rel=0.1)
@@ -323,7 +318,7 @@ def test_a_changed_joint_is_named_sized_and_proven(
 
 
 @pytest.mark.parametrize("group", ["rest", "starts"])
-def test_what_follows_the_time_at_rest_is_told_as_unknown(two_joints: Machine, group: str) -> None:
+def test_what_follows_the_time_at_rest_is_told_as_unknown(group: str) -> None:
     """A valve that stays ajar behind a motion, and one that sticks after a rest."""
     field = []
     for seed in (10, 11):
@@ -339,26 +334,26 @@ def test_what_follows_the_time_at_rest_is_told_as_unknown(two_joints: Machine, g
         if group == "rest":
             sinks = 0.1 * np.exp(-rested_s / 0.7) * (rested_s > 0.0)
             q[6:, 1] -= np.cumsum(sinks[:-6]) / RATE_HZ
-        field.append(record(two_joints, u, q))
-    answer = diagnose(replace(make_case(two_joints), field=field))
+        field.append(record(TWO_JOINTS, u, q))
+    answer = diagnose(replace(make_case(TWO_JOINTS), field=field))
     assert answer.verdict == "unknown"
     assert answer.more["evidence"]["generic"]["group"] == group
 
 
-def test_commands_that_the_reference_lacks_do_not_count(two_joints: Machine) -> None:
+def test_commands_that_the_reference_lacks_do_not_count() -> None:
     slow = np.stack(2 * [np.linspace(-0.4, 0.4, 400)], 1)
     known = slow.copy()
     known[200:210] += 0.1
-    reference = make_side(two_joints, known)
-    assert find_covered(reference, make_side(two_joints, 1.49 * slow)).all()
-    assert not find_covered(reference, make_side(two_joints, 1.51 * slow))[:, [0, -1]].any()
+    reference = make_side(known)
+    assert find_covered(reference, make_side(1.49 * slow)).all()
+    assert not find_covered(reference, make_side(1.51 * slow))[:, [0, -1]].any()
     # A jump is faster than any motion of the reference; its response lasts for half a second behind the dead time.
     u = slow.copy()
     u[200:210, 1] += 0.3
-    side = make_side(two_joints, u)
+    side = make_side(u)
     expected = np.ones((2, 400), dtype=bool)
     # Rates are taken over two samples, here and where it jumps back.
-    width = round((two_joints.dead_time_s + 0.5) * RATE_HZ)
+    width = round((TWO_JOINTS.dead_time_s + 0.5) * RATE_HZ)
     expected[1, 200 : 210 + 1 + width] = False
     covered = find_covered(reference, side)
     assert np.array_equal(covered, expected)
@@ -366,13 +361,13 @@ def test_commands_that_the_reference_lacks_do_not_count(two_joints: Machine) -> 
     side.q[:] = np.linspace(0.0, 1.0, 400)[:, None]
     parts = measure_uncovered(side, covered)
     assert parts == pytest.approx([0.0, 0.5 * (~expected[1]).mean()], abs=0.01)
-    failed = gates.judge_coverage(parts + 0.5, two_joints)
+    failed = gates.judge_coverage(parts + 0.5, TWO_JOINTS)
     assert not failed.passed and "q4" in failed.text
 
 
-def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine) -> None:
-    joints = (machine.joints[0], machine.joints[2])
-    pair = replace(machine, joints=joints, exclusive=(), levers=(), name="two")
+def test_a_joint_without_weight_that_drifts_is_told_as_unknown() -> None:
+    joints = (MACHINE.joints[0], MACHINE.joints[2])
+    pair = replace(MACHINE, joints=joints, exclusive=(), levers=(), name="two")
     case = make_case(pair)
     for recording in case.field:
         recording.q[:, 0] += 0.004 * recording.t_s
@@ -382,8 +377,8 @@ def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine)
 
 
 @pytest.mark.parametrize("step_rad", [0.004, 0.04])
-def test_a_coarse_sensor_is_named_with_its_step(two_joints: Machine, step_rad: float) -> None:
-    case = make_case(two_joints)
+def test_a_coarse_sensor_is_named_with_its_step(step_rad: float) -> None:
+    case = make_case(TWO_JOINTS)
     for one in case.field:
         one.q[:] = np.round(one.q / step_rad) * step_rad
     answer = diagnose(case)
@@ -394,13 +389,11 @@ def test_a_coarse_sensor_is_named_with_its_step(two_joints: Machine, step_rad: f
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.03])
-def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
-    machine: Machine, late_s: float
-) -> None:
+def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(late_s: float) -> None:
     generator = np.random.default_rng(0)
     t_s = np.arange(4000) / RATE_HZ
-    middle = 0.5 * (machine.lower + machine.upper)
-    half = 0.2 * (machine.upper - machine.lower)
+    middle = 0.5 * (MACHINE.lower + MACHINE.upper)
+    half = 0.2 * (MACHINE.upper - MACHINE.lower)
     rates = 2.0 * np.pi * np.array([0.05, 0.07, 0.09, 0.11, 0.13])
 
     def place(at_s: np.ndarray) -> np.ndarray:
@@ -408,26 +401,26 @@ def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
 
     # The tracker sees an arm whose third encoder is wrong by half a degree.
     true = place(t_s) + np.array([0.0, 0.0, 0.009, 0.0, 0.0])
-    tip = Kinematics(machine).pose(torch.as_tensor(true, dtype=torch.float32)).tip_in_base_m
+    tip = Kinematics(MACHINE).pose(torch.as_tensor(true, dtype=torch.float32)).tip_in_base_m
     seen = tip.numpy() + generator.normal(0.0, 0.0015, (len(t_s), 3))
     columns = dict(zip(TOOL_COLUMNS, seen.T, strict=True))
-    shown = make_recording(machine, np.zeros_like(true), place(t_s - late_s), extra=columns)
-    assert measure_clock_shift([shown], machine) == pytest.approx(late_s, abs=0.002)
+    shown = make_recording(MACHINE, np.zeros_like(true), place(t_s - late_s), extra=columns)
+    assert measure_clock_shift([shown], MACHINE) == pytest.approx(late_s, abs=0.002)
 
 
-def test_a_late_clock_is_told_once_and_beside_other_effects(two_joints: Machine) -> None:
-    case = make_case(two_joints, (0.4, 0.4), (1.0, 0.8))
-    sides = (stack_side(side, two_joints) for side in (case.reference, case.field))
+def test_a_late_clock_is_told_once_and_beside_other_effects() -> None:
+    case = make_case(TWO_JOINTS, (0.4, 0.4), (1.0, 0.8))
+    sides = (stack_side(side, TWO_JOINTS) for side in (case.reference, case.field))
     decider = Decider(*sides, np.zeros(2), clock_late_s=0.1)
     named = [(one.name, one.joints) for one in decider.decide().named]
     # The engine calls a late clock a dead time of all joints.
     assert named == [("dead_time", (0, 1)), ("flow_gain", (1,))]
 
 
-def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
+def test_a_simulator_worse_than_standing_still_fails_its_gate() -> None:
     # The second joint goes the other way: a simulator without this errs by twice its motion.
-    case = make_case(two_joints, gain=(1.0, -1.0))
-    sides = (stack_side(side, two_joints) for side in (case.reference, case.field))
+    case = make_case(TWO_JOINTS, gain=(1.0, -1.0))
+    sides = (stack_side(side, TWO_JOINTS) for side in (case.reference, case.field))
     proof = EngineProof(case, Decider(*sides, np.zeros(2)), [], np.random.default_rng(0))
     assert [one.passed for one in proof.judge()] == [True, False]
     assert diagnose(case).verdict == "unknown"

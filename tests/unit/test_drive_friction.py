@@ -16,7 +16,6 @@ from pendulum import run_drive
 
 from actuators.contracts import FitTask
 from actuators.models.friction import LOADS, compute_dry_friction
-from brokk_rl.machine import Machine
 from diagnosis import api
 
 CPU = torch.device("cpu")
@@ -32,9 +31,7 @@ TRUE = {
 """The same by ours. The arm is level in the middle of its travel."""
 
 
-@pytest.fixture(scope="module")
-def arm() -> Machine:
-    return pendulum.make_pendulum()
+ARM = pendulum.make_pendulum()
 
 
 @pytest.mark.parametrize(
@@ -63,16 +60,16 @@ def test_friction_under_load_is_that_of_the_paper(
     assert float(found) == pytest.approx(expected)
 
 
-def test_a_drive_under_load_moves_like_a_pendulum_of_mujoco(arm: Machine) -> None:
+def test_a_drive_under_load_moves_like_a_pendulum_of_mujoco() -> None:
     """Torques given beforehand, in the sense of the motion and against it; MuJoCo has a fifth of the period."""
     u = 0.2 + 0.2 * np.sin(np.arange(400) / 20.0)
-    model: Any = option("actuator", "force", dead_time_s=0.0, **TRUE).build(arm, 1, CPU)
-    found = run_drive(model, arm, u, -0.4)
+    model: Any = option("actuator", "force", dead_time_s=0.0, **TRUE).build(ARM, 1, CPU)
+    found = run_drive(model, ARM, u, -0.4)
     plant = pendulum.build_model(damping=TRUE["viscous_n_s_m"])
     data, budget, expected = mujoco.MjData(plant), pendulum.compute_bam_friction(BAM), []
     data.qpos[0] = -0.4
     for command in u:
-        data.ctrl[0] = torque = float(command * arm.max_force[0])
+        data.ctrl[0] = torque = float(command * ARM.max_force[0])
         for _ in range(5):
             outside = -pendulum.WEIGHT_NM * float(np.cos(data.qpos[0]))
             plant.dof_frictionloss[0] = budget(torque, outside, float(data.qvel[0]))
@@ -80,48 +77,46 @@ def test_a_drive_under_load_moves_like_a_pendulum_of_mujoco(arm: Machine) -> Non
         expected.append(float(data.qpos[0]))
     np.testing.assert_allclose(found, expected, atol=0.04)
     model = option("actuator", "force", dead_time_s=0.0, **{**TRUE, "motor_load": 0.0})
-    without = run_drive(model.build(arm, 1, CPU), arm, u, -0.4)
+    without = run_drive(model.build(ARM, 1, CPU), ARM, u, -0.4)
     assert np.abs(without - expected).max() > 0.5, "the load makes the difference"
 
 
 @pytest.mark.parametrize("load", [0.0, 0.1])
-def test_a_fit_tells_friction_under_load_from_friction_without(
-    arm: Machine, tmp_path: Path, load: float
-) -> None:
+def test_a_fit_tells_friction_under_load_from_friction_without(tmp_path: Path, load: float) -> None:
     """Logs of a controller in MuJoCo C; the arm's weight follows the cosine of its angle."""
     loads = {"load_friction_motor": load, "load_friction_external": load}
     budget = pendulum.compute_bam_friction({**BAM, **loads, "friction_stribeck": 0.0})
-    logs = [pendulum.log_pendulum(arm, budget, 0.08, seed, 10.0) for seed in range(2)]
-    fitted = option("fit", "force").fit(FitTask(arm, logs, [], tmp_path))
+    logs = [pendulum.log_pendulum(ARM, budget, 0.08, seed, 10.0) for seed in range(2)]
+    fitted = option("fit", "force").fit(FitTask(ARM, logs, [], tmp_path))
     for name in ("mass_kg", "viscous_n_s_m", "offset_n", "pose_cos_n"):
         assert getattr(fitted, name)["arm"] == pytest.approx(TRUE[name], rel=0.05), name
     assert fitted.coulomb_n["arm"] == pytest.approx(TRUE["coulomb_n"], rel=0.1)
     assert fitted.stribeck_n["arm"] == pytest.approx(0.0, abs=0.01)
     assert fitted.motor_load["arm"] == pytest.approx(load, abs=0.005)
     assert fitted.outside_load["arm"] == pytest.approx(load, abs=0.005)
-    fitted.build(arm, 1, CPU)
+    fitted.build(ARM, 1, CPU)
 
 
-def test_a_fit_recovers_the_whole_of_m5(arm: Machine, tmp_path: Path) -> None:
+def test_a_fit_recovers_the_whole_of_m5(tmp_path: Path) -> None:
     budget = pendulum.compute_bam_friction(BAM)
-    logs = [pendulum.log_pendulum(arm, budget, 0.08, seed, 15.0) for seed in range(3)]
-    fitted = option("fit", "force").fit(FitTask(arm, logs, [], tmp_path))
+    logs = [pendulum.log_pendulum(ARM, budget, 0.08, seed, 15.0) for seed in range(3)]
+    fitted = option("fit", "force").fit(FitTask(ARM, logs, [], tmp_path))
     for name, value in TRUE.items():
         assert getattr(fitted, name)["arm"] == pytest.approx(value, rel=0.05), name
 
 
-def test_effects_of_friction_are_numbers_of_the_drive(arm: Machine) -> None:
+def test_effects_of_friction_are_numbers_of_the_drive() -> None:
     """A drive with the effects around it and one with their numbers move alike, to the last bit."""
     u = 0.25 + 0.1 * np.sin(np.arange(100) / 22.0)
     plain = {name: TRUE[name] for name in ("mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n")}
     drive = replace(option("actuator", "force", **plain), stribeck_m_s=TRUE["stribeck_m_s"])
-    model: Any = drive.build(arm, 1, CPU)
-    model = option("effect", "stribeck_friction", stribeck_n=0.2).wrap(model, arm, 1, CPU)
+    model: Any = drive.build(ARM, 1, CPU)
+    model = option("effect", "stribeck_friction", stribeck_n=0.2).wrap(model, ARM, 1, CPU)
     load = option("effect", "load_friction", motor_load=0.2, outside_load=0.05)
-    model = load.wrap(model, arm, 1, CPU)
-    model = option("effect", "pose_force", pose_sin_n=0.0, pose_cos_n=1.5).wrap(model, arm, 1, CPU)
-    whole = option("actuator", "force", **TRUE).build(arm, 1, CPU)
-    np.testing.assert_array_equal(run_drive(model, arm, u, -0.4), run_drive(whole, arm, u, -0.4))
+    model = load.wrap(model, ARM, 1, CPU)
+    model = option("effect", "pose_force", pose_sin_n=0.0, pose_cos_n=1.5).wrap(model, ARM, 1, CPU)
+    whole = option("actuator", "force", **TRUE).build(ARM, 1, CPU)
+    np.testing.assert_array_equal(run_drive(model, ARM, u, -0.4), run_drive(whole, ARM, u, -0.4))
 
 
 @pytest.mark.slow
@@ -133,12 +128,12 @@ def test_effects_of_friction_are_numbers_of_the_drive(arm: Machine) -> None:
     ],
 )
 def test_a_diagnosis_names_what_a_drive_lacks(
-    arm: Machine, tmp_path: Path, effect: str, friction: dict[str, float]
+    tmp_path: Path, effect: str, friction: dict[str, float]
 ) -> None:
     without = {"friction_stribeck": 0.0, "load_friction_motor": 0.0, "load_friction_external": 0.0}
     budget = pendulum.compute_bam_friction({**BAM, **without, **friction})
-    logs = tuple(pendulum.log_pendulum(arm, budget, 0.08, seed, 8.0) for seed in range(5))
+    logs = tuple(pendulum.log_pendulum(ARM, budget, 0.08, seed, 8.0) for seed in range(5))
     known = {**TRUE, "stribeck_n": 0.0, "motor_load": 0.0, "outside_load": 0.0}
     simulator = option("actuator", "force", **known)
-    answer = api.diagnose(api.RecordingSet(logs, arm), tmp_path, simulator=simulator).answer
+    answer = api.diagnose(api.RecordingSet(logs, ARM), tmp_path, simulator=simulator).answer
     assert effect in {one.effect for one in answer.selected}

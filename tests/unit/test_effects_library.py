@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from motion import draw_commands, make_recording, roll
 
 from actuators.effects.composition import Library
 from actuators.identify import dead_time
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")
 EFFECTS = """
@@ -34,33 +33,31 @@ def library(share: float | dict[str, float], *specs: Any) -> Library:
     return Library(share=share, effects={spec.name(): spec for spec in specs})
 
 
-def test_all_together_are_one_around_the_other(machine: Machine) -> None:
+def test_all_together_are_one_around_the_other() -> None:
     chance = ("frame_loss", "delay_jitter", "sensor_noise")
     specs = [fixed(name) for name in EFFECTS if name not in chance]
-    u = draw_commands(machine, 100, 3, 1)
-    stacked, together = (option("actuator", "lag").build(machine, 3, CPU) for _ in range(2))
+    u = draw_commands(MACHINE, 100, 3, 1)
+    stacked, together = (option("actuator", "lag").build(MACHINE, 3, CPU) for _ in range(2))
     for spec in specs:
-        stacked = spec.wrap(stacked, machine, 3, CPU)
-    together = library(1.0, *specs).wrap(together, machine, 3, CPU)
-    found, expected = (roll(model, machine, u) for model in (together, stacked))
+        stacked = spec.wrap(stacked, MACHINE, 3, CPU)
+    together = library(1.0, *specs).wrap(together, MACHINE, 3, CPU)
+    found, expected = (roll(model, MACHINE, u) for model in (together, stacked))
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
     torch.testing.assert_close(together.measure(u[7]), stacked.measure(u[7]), rtol=0, atol=1e-6)
     assert together.sides == {"command", "speed", "joints", "measurement"}
 
 
-def test_where_no_effect_is_there_nothing_changes(machine: Machine) -> None:
-    plain, inner = (option("actuator", "mlp").build(machine, 3, CPU) for _ in range(2))
-    model = replace(option("effect", "library"), share=0.0).wrap(inner, machine, 3, CPU)
-    u = draw_commands(machine, 60, 3, 1)
-    assert torch.equal(roll(model, machine, u), roll(plain, machine, u))
+def test_where_no_effect_is_there_nothing_changes() -> None:
+    plain, inner = (option("actuator", "mlp").build(MACHINE, 3, CPU) for _ in range(2))
+    model = replace(option("effect", "library"), share=0.0).wrap(inner, MACHINE, 3, CPU)
+    u = draw_commands(MACHINE, 60, 3, 1)
+    assert torch.equal(roll(model, MACHINE, u), roll(plain, MACHINE, u))
     assert torch.equal(model.measure(u[0]), u[0])
 
 
-def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_others(
-    machine: Machine,
-) -> None:
+def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_others() -> None:
     shipped = option("effect", "library")
-    model = shipped.wrap(option("actuator", "ideal").build(machine, 6000, CPU), machine, 6000, CPU)
+    model = shipped.wrap(option("actuator", "ideal").build(MACHINE, 6000, CPU), MACHINE, 6000, CPU)
     there = {}
     for name, spec in shipped.effects.items():
         off = []
@@ -81,14 +78,14 @@ def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_
     assert (after[:3000] != before[:3000]).any(), "another machine"
 
 
-def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: Machine) -> None:
+def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes() -> None:
     """Both would break the trace; a CUDA graph can hold what is left."""
-    u = draw_commands(machine, 20, 4, 1)
+    u = draw_commands(MACHINE, 20, 4, 1)
     torch.manual_seed(0)
     models = []
     for _ in range(2):
-        inner = option("actuator", "lag").build(machine, 4, CPU)
-        models.append(option("effect", "library").wrap(inner, machine, 4, CPU))
+        inner = option("actuator", "lag").build(MACHINE, 4, CPU)
+        models.append(option("effect", "library").wrap(inner, MACHINE, 4, CPU))
     plain, traced = models
     step = torch.compile(traced.step, backend="eager", fullgraph=True, dynamic=False)
     reset = torch.compile(traced.reset, backend="eager", fullgraph=True, dynamic=False)
@@ -104,19 +101,17 @@ def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: 
 
 
 @pytest.mark.parametrize("shift_s", [-0.05, -0.02, 0.03, 0.05])
-def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
-    shift_s: float, machine: Machine
-) -> None:
+def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(shift_s: float) -> None:
     """Measured as from recordings of the machine; its resolution is 0.01 s."""
     found = []
     for added in (0.0, shift_s):
-        model = option("actuator", "mlp").build(machine, 4, CPU)
-        model = library(1.0, fixed("dead_time", dead_time_s=added)).wrap(model, machine, 4, CPU)
+        model = option("actuator", "mlp").build(MACHINE, 4, CPU)
+        model = library(1.0, fixed("dead_time", dead_time_s=added)).wrap(model, MACHINE, 4, CPU)
         levels = torch.rand(150, 4, 5, generator=torch.Generator().manual_seed(0)) * 1.4 - 0.7
         u = levels.repeat_interleave(8, 0) * (torch.arange(5) == 0)
-        rows = zip(u.unbind(1), roll(model, machine, u)[:-1].unbind(1), strict=True)
-        recordings = [make_recording(machine, one.numpy(), q.numpy()) for one, q in rows]
-        delay = dead_time.estimate_dead_times(recordings, machine, np.random.default_rng(0))["q1"]
+        rows = zip(u.unbind(1), roll(model, MACHINE, u)[:-1].unbind(1), strict=True)
+        recordings = [make_recording(MACHINE, one.numpy(), q.numpy()) for one, q in rows]
+        delay = dead_time.estimate_dead_times(recordings, MACHINE, np.random.default_rng(0))["q1"]
         found.append(delay.value_s)
     assert found[1] - found[0] == pytest.approx(shift_s, abs=0.0101)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import names, option
+from composed import MACHINE, names, option
 from motion import rest
 
 from actuators.effects.load import Creep, LoadDependence
@@ -35,9 +35,9 @@ ABSENT = {
 """Effects of the library that a joint cannot have, by what its command sets."""
 
 
-def stretched(machine: Machine, joint: int, by: float) -> Machine:
+def stretched(joint: int, by: float) -> Machine:
     """Returns the machine with one joint of another travel and speed."""
-    joints = list(machine.joints)
+    joints = list(MACHINE.joints)
     one = joints[joint]
     joints[joint] = replace(
         one,
@@ -46,7 +46,7 @@ def stretched(machine: Machine, joint: int, by: float) -> Machine:
         max_speed=replace(one.max_speed, value=by * one.max_speed.value),
         home=by * one.home,
     )
-    return replace(machine, joints=tuple(joints))
+    return replace(MACHINE, joints=tuple(joints))
 
 
 def typical(machine: Machine, name: str, number: str) -> np.ndarray:
@@ -109,27 +109,25 @@ def test_a_diagnosis_has_what_a_load_does_to_the_joints_of_every_machine(name: s
             assert (low <= kind.typical(number)).all() and (kind.typical(number) <= high).all()
 
 
-def test_sizes_grow_with_the_joint_that_they_are_on_and_no_other(machine: Machine) -> None:
-    half = stretched(machine, 2, 0.5)
+def test_sizes_grow_with_the_joint_that_they_are_on_and_no_other() -> None:
+    half = stretched(2, 0.5)
     for name, number in (("backlash", "gap_rad"), ("creep", "sink_rad_s")):
-        ratio = typical(half, name, number) / typical(machine, name, number)
+        ratio = typical(half, name, number) / typical(MACHINE, name, number)
         assert ratio == pytest.approx([1.0, 1.0, 0.5, 1.0, 1.0])
     assert typical(half, "dead_band", "extend") == pytest.approx([0.06] * 5)
 
 
-def test_times_follow_the_longer_of_control_period_and_dead_time(machine: Machine) -> None:
-    quick = replace(machine, period_s=0.01, dead_time_s=0.055)
+def test_times_follow_the_longer_of_control_period_and_dead_time() -> None:
+    quick = replace(MACHINE, period_s=0.01, dead_time_s=0.055)
     assert measure_time_scale(quick) == pytest.approx(0.2)
     assert typical(quick, "rate_limit", "stroke_s") == pytest.approx([0.08] * 5)
     assert choose_horizon_s(quick) == pytest.approx(1.0)
-    assert choose_horizon_s(replace(machine, dead_time_s=0.6)) == 5.0, "no free run is longer"
+    assert choose_horizon_s(replace(MACHINE, dead_time_s=0.6)) == 5.0, "no free run is longer"
 
 
-def test_a_range_over_the_typical_size_is_mirrored_about_the_neutral_value(
-    machine: Machine,
-) -> None:
+def test_a_range_over_the_typical_size_is_mirrored_about_the_neutral_value() -> None:
     spec = replace(option("effect", "saturation"), level=(0.0, 2.0, "typical"))
-    model = spec.wrap(option("actuator", "ideal").build(machine, 2000, CPU), machine, 2000, CPU)
+    model = spec.wrap(option("actuator", "ideal").build(MACHINE, 2000, CPU), MACHINE, 2000, CPU)
     level = model.parameters["level"]
     assert level.min().item() == pytest.approx(0.5, abs=0.01), "two typical sizes below 1"
     assert level.max().item() == pytest.approx(1.0, abs=0.01)
@@ -144,10 +142,10 @@ def test_a_weight_on_a_machine_without_masses_is_still_refused(spec: Any) -> Non
         spec.wrap(option("actuator", "ideal").build(small, 1, CPU), small, 1, CPU)
 
 
-def test_a_pose_on_a_machine_with_masses_is_refused(machine: Machine) -> None:
+def test_a_pose_on_a_machine_with_masses_is_refused() -> None:
     spec = LoadDependence(joints="all", sensitivity=0.0, pose_sin=0.2)
     with pytest.raises(ConfigError, match=r"has known masses.*give the other numbers"):
-        spec.wrap(option("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU)
+        spec.wrap(option("actuator", "ideal").build(MACHINE, 1, CPU), MACHINE, 1, CPU)
 
 
 def test_the_pose_term_is_a_line_over_a_cylinder_and_a_harmonic_of_an_angle() -> None:

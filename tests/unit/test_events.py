@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import every, option
+from composed import MACHINE, every, option
 from promises import NUM_ENVS, check_world
 
 from brokk_rl.errors import ConfigError
@@ -48,9 +48,9 @@ def vary(world: Any) -> Any:
     return world
 
 
-def drive_into_the_ground(machine: Machine, worlds: list[Any]) -> list[list[np.ndarray]]:
+def drive_into_the_ground(worlds: list[Any]) -> list[list[np.ndarray]]:
     """Returns positions and forces of every world over time."""
-    increment = torch.zeros(NUM, machine.num_joints)
+    increment = torch.zeros(NUM, MACHINE.num_joints)
     increment[:, 1], increment[:, 0] = 0.006, 0.01
     found: list[list[np.ndarray]] = [[] for _ in worlds]
     for step in range(50):
@@ -61,13 +61,13 @@ def drive_into_the_ground(machine: Machine, worlds: list[Any]) -> list[list[np.n
     return found
 
 
-def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> None:
-    world: Any = vary(NATIVE.build(machine, "cpu", None, events=FIXED))
-    home = torch.tensor(machine.home).float().repeat(NUM, 1)
+def test_each_world_is_plain_mujoco_with_edited_numbers() -> None:
+    world: Any = vary(NATIVE.build(MACHINE, "cpu", None, events=FIXED))
+    home = torch.tensor(MACHINE.home).float().repeat(NUM, 1)
     world.reset(torch.ones(NUM, dtype=torch.bool), home, make_nominal_scenes(NUM))
     for i in range(NUM):
-        edited = compile_model(machine, 0.01)
-        for j, name in enumerate(machine.joint_names):
+        edited = compile_model(MACHINE, 0.01)
+        for j, name in enumerate(MACHINE.joint_names):
             body = edited.joint(name).bodyid[0]
             edited.body_mass[body] *= float(FACTORS["mass"][i, j])
             edited.body_inertia[body] *= float(FACTORS["mass"][i, j])
@@ -84,10 +84,10 @@ def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> Non
 
 
 @pytest.mark.slow
-def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(machine: Machine) -> None:
+def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones() -> None:
     sim = dataclasses.replace(option("sim", "warp"), num_worlds=NUM)
-    worlds = [vary(spec.build(machine, "cpu", NUM, events=FIXED)) for spec in (NATIVE, sim)]
-    native, warp = (np.array(path) for path in drive_into_the_ground(machine, worlds))
+    worlds = [vary(spec.build(MACHINE, "cpu", NUM, events=FIXED)) for spec in (NATIVE, sim)]
+    native, warp = (np.array(path) for path in drive_into_the_ground(worlds))
     assert native[..., -1].max() > 0
     free = native[:12]
     np.testing.assert_allclose(warp[:12], free, atol=2e-5)
@@ -97,23 +97,23 @@ def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(machine: M
 
 
 @every("event")
-def test_every_event_keeps_a_world_a_world(name: str, machine: Machine) -> None:
+def test_every_event_keeps_a_world_a_world(name: str) -> None:
     class Varied:
         def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
             return NATIVE.build(machine, CPU, num_worlds, events=(option("event", name),))
 
-    check_world(Varied(), machine, make_nominal_scenes(NUM_ENVS), "cpu")
+    check_world(Varied(), MACHINE, make_nominal_scenes(NUM_ENVS), "cpu")
 
 
-def test_an_event_draws_when_it_says(machine: Machine) -> None:
+def test_an_event_draws_when_it_says() -> None:
     def build(**changes: Any) -> Any:
-        return NATIVE.build(machine, CPU, NUM, events=(event("mass", **changes),))
+        return NATIVE.build(MACHINE, CPU, NUM, events=(event("mass", **changes),))
 
     def look(world: Any) -> torch.Tensor:
         return world._properties.factors["mass"].clone()
 
-    still = torch.zeros(NUM, machine.num_joints)
-    home = torch.tensor(machine.home).float().repeat(NUM, 1)
+    still = torch.zeros(NUM, MACHINE.num_joints)
+    home = torch.tensor(MACHINE.home).float().repeat(NUM, 1)
     first = torch.tensor([True, False, False, False])
     torch.manual_seed(1)
     startup, reset = build(when="startup"), build(when="reset")
@@ -128,11 +128,11 @@ def test_an_event_draws_when_it_says(machine: Machine) -> None:
         assert torch.equal(look(world)[1:], before[1:])
 
 
-def test_a_restored_state_keeps_its_properties(machine: Machine) -> None:
-    world: Any = NATIVE.build(machine, CPU, NUM, events=(event("mass"), event("yield_force")))
+def test_a_restored_state_keeps_its_properties() -> None:
+    world: Any = NATIVE.build(MACHINE, CPU, NUM, events=(event("mass"), event("yield_force")))
     state = world.state_dict()
     kept = world._properties.factors["mass"].clone()
-    home = torch.tensor(machine.home).float().repeat(NUM, 1)
+    home = torch.tensor(MACHINE.home).float().repeat(NUM, 1)
     world.reset(torch.ones(NUM, dtype=torch.bool), home, make_nominal_scenes(NUM))
     assert not torch.equal(world._properties.factors["mass"], kept)
     world.load_state_dict(state)

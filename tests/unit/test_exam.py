@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from composed import option
+from composed import MACHINE, option
 from conftest import Brokk
 from small_exam import SMALL
 
@@ -37,9 +37,9 @@ def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDe
     return mix.questions(machine, option("exam_plants", "valves"), np.random.default_rng(seed))
 
 
-def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine) -> None:
+def test_cases_have_the_shares_effects_and_sizes_of_their_kinds() -> None:
     mix = option("exam_mix", "main")
-    found = questions(mix, machine, 3)
+    found = questions(mix, MACHINE, 3)
     counts = {"none": 15, "faint": 10, "one": 35, "several": 20, "outside": 20}
     assert Counter(one.kind for one in found) == counts
     single = Counter(one.faults[0].effect for one in found if one.kind == "one")
@@ -54,7 +54,7 @@ def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine
         low, high = mix.faint_sizes if one.kind == "faint" else mix.sizes
         for fault in one.faults:
             assert low <= fault.size <= high
-            has = np.isin(machine.joint_names, fault.joints)
+            has = np.isin(MACHINE.joint_names, fault.joints)
             if one.kind == "outside":
                 assert fault.parameters["severity"].tolist() == (fault.size * has).tolist()
                 continue
@@ -63,7 +63,7 @@ def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine
                 away = abs(mix.troubles[fault.effect].numbers[name][1] - nothing)
                 values = np.abs(fault.parameters[name][has] - nothing)
                 np.testing.assert_allclose(values, fault.size * away)
-    again, other = questions(mix, machine, 3), questions(mix, machine, 4)
+    again, other = questions(mix, MACHINE, 3), questions(mix, MACHINE, 4)
     assert repr(again) == repr(found) != repr(other)
 
 
@@ -83,7 +83,7 @@ def exam(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "exam"))
 
 
-def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: Machine) -> None:
+def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path) -> None:
     labels = exam / dataset.LABELS_FILE
     assert labels.stat().st_mode & 0o777 == 0o600
     sealed = hashlib.sha256(labels.read_bytes()).hexdigest()
@@ -95,11 +95,11 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
         assert set(pq.read_schema(file).metadata) == {
             b"brokk.schema", b"brokk.machine", b"brokk.rate_hz", b"brokk.created", b"brokk.fingerprint"
         }  # fmt: skip
-        found = record.read_recording(file, machine)
+        found = record.read_recording(file, MACHINE)
         moving = np.abs(found.u) > 0
-        exclusive = machine.is_exclusive
+        exclusive = MACHINE.is_exclusive
         assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
-        assert (found.q >= machine.lower - 0.05).all() and (found.q <= machine.upper + 0.05).all()
+        assert (found.q >= MACHINE.lower - 0.05).all() and (found.q <= MACHINE.upper + 0.05).all()
     told = json.loads(labels.read_text())["cases"]
     (name,) = [case["effects"][0]["effect"] for case in told if case["effects"]]
     assert not any(name.encode() in file.read_bytes() for file in files)
@@ -189,19 +189,19 @@ def test_a_make_that_was_interrupted_goes_on_and_gives_the_cases_of_its_salt(
         assert path.read_bytes() == (part / path.relative_to(made)).read_bytes()
 
 
-def sit(candidate: run_cases.Candidate, cases: list[Path], answers: Path, machine: Machine) -> int:
+def sit(candidate: run_cases.Candidate, cases: list[Path], answers: Path) -> int:
     """Returns how many cases have no answer."""
-    return run_cases.answer_cases(candidate, cases, answers, machine, 1)
+    return run_cases.answer_cases(candidate, cases, answers, MACHINE, 1)
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
-    exam: Path, machine: Machine, brokk: Brokk, tmp_path: Path, caplog: Any
+    exam: Path, brokk: Brokk, tmp_path: Path, caplog: Any
 ) -> None:
     first, second = sorted((exam / CASES_FOLDER).iterdir())
     answers = tmp_path / "answers"
     answers.mkdir()
-    assert sit(Recorder(ValueError("ran away")), [first], answers, machine) == 1
-    assert sit(ConstantAnswer(effect=None, probability=0.5), [second], answers, machine) == 0
+    assert sit(Recorder(ValueError("ran away")), [first], answers) == 1
+    assert sit(ConstantAnswer(effect=None, probability=0.5), [second], answers) == 0
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for sat, missed in ((2, 1), (1, 0)):
         marks = tmp_path / f"marks_{missed}"
@@ -238,16 +238,16 @@ class Recorder:
 
 
 def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_again(
-    machine: Machine, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     case, answers = tmp_path / "exam" / CASES_FOLDER / "0000", tmp_path / "answers"
     (case / "field").mkdir(parents=True)
     (case / "field" / "00.parquet").touch()
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
-    assert sit(first, [case], answers, machine) == 1
+    assert sit(first, [case], answers) == 1
     assert run_cases.read_facts(answers / "0000" / run_cases.NOTE_FILE)["error"]
-    assert sit(second, [case], answers, machine) == sit(third, [case], answers, machine) == 0
+    assert sit(second, [case], answers) == sit(third, [case], answers) == 0
     ((given, content),) = second.given
     assert content == ["field", "field/00.parquet"] and third.given == []
     assert tmp_path not in given.parents and "0000" not in str(given)
@@ -255,18 +255,16 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     assert run_cases.read_facts(answers / "0000" / run_cases.NOTE_FILE)["error"] is None
 
 
-def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_path: Path) -> None:
+def test_a_program_that_fails_or_takes_too_long_says_so(tmp_path: Path) -> None:
     for words, limit_s, message in (("exit 1", 10.0, "exit status 1"), ("sleep 9", 0.2, "within")):
         command = run_cases.CommandCandidate(
             command=("sh", "-c", f"{words} #{{case}}{{out}}"), limit_s=limit_s, threads=1
         )
         with pytest.raises(RecordingError, match=message):
-            command.answer(tmp_path, tmp_path / "out", machine)
+            command.answer(tmp_path, tmp_path / "out", MACHINE)
 
 
-def test_an_interrupted_program_leaves_no_note_and_sits_again(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_an_interrupted_program_leaves_no_note_and_sits_again(tmp_path: Path) -> None:
     case, answers = tmp_path / "case", tmp_path / "answers"
     case.mkdir()
     (case / "a").touch()
@@ -276,10 +274,10 @@ def test_an_interrupted_program_leaves_no_note_and_sits_again(
         command=(sys.executable, "-c", program, "{case}", "{out}"), limit_s=10.0, threads=1
     )
     with pytest.raises(KeyboardInterrupt):
-        sit(command, [case], answers, machine)
+        sit(command, [case], answers)
     assert not run_cases.is_begun(answers / "case")
     failing = replace(command, command=("sh", "-c", "exit 3 #{case}{out}"))
-    sit(failing, [case], answers, machine)
+    sit(failing, [case], answers)
     assert run_cases.is_begun(answers / "case")
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from small_exam import run_model
 
 from brokk_rl.commands import find_rest, read_targets
@@ -34,15 +34,15 @@ def smooth(name: str) -> DrawnPlants:
     return replace(option("exam_plants", name), roughness={"mild": 0.0})
 
 
-def clean(machine: Machine) -> PlantParameters:
+def clean() -> PlantParameters:
     """A machine without nuisances, noise or change of lever, so that numbers can be worked by hand."""
-    _, numbers = smooth("valves").draw(machine, replace(RUN, seed=5))
+    _, numbers = smooth("valves").draw(MACHINE, replace(RUN, seed=5))
     for name, value in {
         "noise_rad": 0.0, "overlap_extend": 0.1, "overlap_retract": 0.1, "notch": 0.2, "flow_force": 0.0,
         "extend": 1.0, "retract": 1.0, "linkage_rad": 1.57, "demand": 0.2, "transport_s": 0.4,
         "coulomb": 0.02, "pin": 0.0,
     }.items():  # fmt: skip
-        numbers[name] = np.full(machine.num_joints, value)
+        numbers[name] = np.full(MACHINE.num_joints, value)
     return numbers
 
 
@@ -51,10 +51,10 @@ def change(numbers: PlantParameters, effect: str, **sizes: np.ndarray) -> PlantP
     return changed
 
 
-def played(machine: Machine, runs: list[tuple[PlantParameters, np.ndarray]]) -> np.ndarray:
+def played(runs: list[tuple[PlantParameters, np.ndarray]]) -> np.ndarray:
     """Positions of machines side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
     numbers, u = [one for one, _ in runs], np.stack([given for _, given in runs], 1)
-    batch = PlantBatch(machine, "sensing", [RUN] * len(runs), numbers, len(u))
+    batch = PlantBatch(MACHINE, "sensing", [RUN] * len(runs), numbers, len(u))
     return follow(ValveArm(batch, STEP_S, SensingValves), u)
 
 
@@ -73,8 +73,8 @@ def follow(plant: PlantLink, u: np.ndarray) -> np.ndarray:
     return np.array(path)
 
 
-def push(machine: Machine, level: float, steps: int = 50, joint: int = Q3) -> np.ndarray:
-    u = np.zeros((steps, machine.num_joints))
+def push(level: float, steps: int = 50, joint: int = Q3) -> np.ndarray:
+    u = np.zeros((steps, MACHINE.num_joints))
     u[:, joint] = level
     return u
 
@@ -83,14 +83,14 @@ def on_q3(machine: Machine, none: float, value: float) -> np.ndarray:
     return np.where(np.arange(machine.num_joints) == Q3, value, none)
 
 
-def find_speeds(machine: Machine, runs: list[tuple[PlantParameters, float]]) -> np.ndarray:
+def find_speeds(runs: list[tuple[PlantParameters, float]]) -> np.ndarray:
     """Steady speeds of q3, of full speed."""
-    q = played(machine, [(numbers, push(machine, level)) for numbers, level in runs])[:, :, Q3]
-    return (q[50] - q[40]) / (10 * machine.period_s) / machine.max_speed[Q3]
+    q = played([(numbers, push(level)) for numbers, level in runs])[:, :, Q3]
+    return (q[50] - q[40]) / (10 * MACHINE.period_s) / MACHINE.max_speed[Q3]
 
 
-def test_a_clean_machine_goes_at_full_speed_and_by_its_notches_below(machine: Machine) -> None:
-    found = find_speeds(machine, [(clean(machine), u) for u in (1.0, -1.0, 0.55, 0.19, 0.08)])
+def test_a_clean_machine_goes_at_full_speed_and_by_its_notches_below() -> None:
+    found = find_speeds([(clean(), u) for u in (1.0, -1.0, 0.55, 0.19, 0.08)])
     # opening 0.5 of 0.9: (2 * 0.5 - 0.2) / 1.8; opening 0.1, in the notches: 0.01 / (0.2 * 1.8)
     assert found == pytest.approx([1.0, -1.0, 0.444, 0.028, 0.0], abs=0.035)
     assert abs(found[4]) < 0.002
@@ -107,37 +107,37 @@ STEADY = {
 """Sizes, the command, and the opening or the factor on the speed that they leave."""
 
 
-def test_an_effect_changes_the_steady_speed_as_its_number_says(machine: Machine) -> None:
-    well, runs, expected = clean(machine), [], []
+def test_an_effect_changes_the_steady_speed_as_its_number_says() -> None:
+    well, runs, expected = clean(), [], []
     for effect, (sizes, level, value) in STEADY.items():
-        numbers = {name: on_q3(machine, *pair) for name, pair in sizes.items()}
+        numbers = {name: on_q3(MACHINE, *pair) for name, pair in sizes.items()}
         runs.append((change(well, effect, **numbers), level))
         by_area = effect in ("dead_band", "saturation")
         expected.append(compute_notch_area(np.array(value), np.array(0.2)) if by_area else value)
-    found = find_speeds(machine, [*runs, (well, 1.0)])
+    found = find_speeds([*runs, (well, 1.0)])
     assert found[:-1] / found[-1] == pytest.approx(expected, abs=0.04)
 
 
-def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine) -> None:
+def test_a_fault_in_time_costs_the_way_of_that_time() -> None:
     late = {"dead_time": ("dead_time_s", 0.08, 0.08), "lag": ("time_constant_s", 0.1, 0.10)}
     late["rate_limit"] = ("stroke_s", 0.5, 0.25)
-    well = clean(machine)
-    runs = [(well, push(machine, 1.0))]
+    well = clean()
+    runs = [(well, push(1.0))]
     for effect, (name, value, _) in late.items():
-        slower = change(well, effect, **{name: on_q3(machine, 0.0, value)})
-        runs.append((slower, push(machine, 1.0)))
-    q = played(machine, runs)[:, :, Q3]
-    lost_s = (q[-1, 0] - q[-1, 1:]) / ((q[50, 0] - q[40, 0]) / (10 * machine.period_s))
+        slower = change(well, effect, **{name: on_q3(MACHINE, 0.0, value)})
+        runs.append((slower, push(1.0)))
+    q = played(runs)[:, :, Q3]
+    lost_s = (q[-1, 0] - q[-1, 1:]) / ((q[50, 0] - q[40, 0]) / (10 * MACHINE.period_s))
     # a ramp of 0.5 s costs half of it and a little for the overlap and the notches
     assert lost_s == pytest.approx([expected for _, _, expected in late.values()], abs=0.04)
 
 
-def test_a_leak_lets_a_heavy_joint_sink_and_the_slew_not(machine: Machine) -> None:
-    size = np.full(machine.num_joints, 0.05)
-    numbers = change(clean(machine), "creep", sink_rad_s=size)
-    weight = Arm(machine, {name: value[None] for name, value in numbers.items()})
-    load = weight.load(machine.home[None])[0]
-    q = played(machine, [(numbers, push(machine, 0.0, 200))])[:, 0]
+def test_a_leak_lets_a_heavy_joint_sink_and_the_slew_not() -> None:
+    size = np.full(MACHINE.num_joints, 0.05)
+    numbers = change(clean(), "creep", sink_rad_s=size)
+    weight = Arm(MACHINE, {name: value[None] for name, value in numbers.items()})
+    load = weight.load(MACHINE.home[None])[0]
+    q = played([(numbers, push(0.0, 200))])[:, 0]
     found = (q[200] - q[100]) / 5.0
     # turbulent: nominal at two fifths of the yield force, with the root of the load elsewhere
     expected = 0.4 * 0.05 * np.sign(load) * np.sqrt(np.abs(load) / 0.4)
@@ -145,11 +145,11 @@ def test_a_leak_lets_a_heavy_joint_sink_and_the_slew_not(machine: Machine) -> No
     assert found[Q3] == pytest.approx(expected[Q3], rel=0.25)
 
 
-def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine) -> None:
-    numbers = change(clean(machine), "flow_sharing", demand=np.full(5, 0.5))
+def test_a_worn_pump_slows_joints_that_move_together_only() -> None:
+    numbers = change(clean(), "flow_sharing", demand=np.full(5, 0.5))
     together = np.ones((50, 5)) * [1.0, 0.0, 1.0, 1.0, 1.0]
-    q = played(machine, [(numbers, together), (numbers, push(machine, 1.0))])
-    flow, alone = (q[50] - q[40]) / 0.5 / machine.max_speed
+    q = played([(numbers, together), (numbers, push(1.0))])
+    flow, alone = (q[50] - q[40]) / 0.5 / MACHINE.max_speed
     assert alone[Q3] == pytest.approx(1.0, abs=0.05)
     assert flow.sum() == pytest.approx(2.0, rel=0.15)  # the pump's flow at half each
     assert np.ptp(flow[[0, 2, 3, 4]]) > 0.1  # no proportional split: the heaviest is starved
@@ -201,12 +201,12 @@ def test_weight_and_tool_are_those_of_the_machine(name: str) -> None:
     assert np.cos(pitch_rad - pose.pitch_rad.numpy()) == pytest.approx(np.ones(6), abs=1e-6)
 
 
-def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says(machine: Machine) -> None:
+def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says() -> None:
     zero, longer = np.zeros((1, 5)), np.array([[0.0, 0.0, 0.02, 0.0, 0.0]])
     tips = []
     for change in ({}, {"extra_m": longer}, {"pitch_rad": zero + 0.03}):
         numbers = dict.fromkeys(("extra_m", "roll_rad", "pitch_rad"), zero) | change
-        tips.append(Arm(machine, numbers).tool(zero)[0][0])  # stretched along x
+        tips.append(Arm(MACHINE, numbers).tool(zero)[0][0])  # stretched along x
     assert tips[1] - tips[0] == pytest.approx([0.02, 0.0, 0.0], abs=1e-9)
     x, y, z = tips[0]
     cos, sin = np.cos(0.03), np.sin(0.03)
@@ -214,10 +214,10 @@ def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says(machine:
     assert tips[2] == pytest.approx([cos * x + sin * z, y, -sin * x + cos * z], abs=1e-9)
 
 
-def test_backlash_takes_its_gap_at_each_reversal(machine: Machine) -> None:
-    u, well = np.concatenate([push(machine, 0.6, 30), push(machine, -0.6, 30)]), clean(machine)
-    worn = change(well, "backlash", gap_rad=on_q3(machine, 0.0, 0.02))
-    before, after = played(machine, [(well, u), (worn, u)])[:, :, Q3].T
+def test_backlash_takes_its_gap_at_each_reversal() -> None:
+    u, well = np.concatenate([push(0.6, 30), push(-0.6, 30)]), clean()
+    worn = change(well, "backlash", gap_rad=on_q3(MACHINE, 0.0, 0.02))
+    before, after = played([(well, u), (worn, u)])[:, :, Q3].T
     assert before.max() - after.max() == pytest.approx(0.01, abs=0.001)  # half, from the middle
     assert after[-1] - before[-1] == pytest.approx(0.01, abs=0.001)  # the other half
 
@@ -353,9 +353,9 @@ def test_a_torque_limit_is_a_cap_of_the_duty() -> None:
     assert np.delete(n["duty_cap"], Q3).tolist() == [1.0] * 4
 
 
-def test_servos_are_refused_on_valves(machine: Machine) -> None:
+def test_servos_are_refused_on_valves() -> None:
     with pytest.raises(ConfigError, match="machine=so101"):
-        option("exam_plants", "servos").build(machine, [RUN], 1.0)
+        option("exam_plants", "servos").build(MACHINE, [RUN], 1.0)
 
 
 @pytest.mark.parametrize("name", FAMILIES)

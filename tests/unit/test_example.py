@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine
 from brokk_rl.sim.scene import make_nominal_scenes
 
 ROOT = Path(__file__).parents[2]
@@ -69,21 +68,21 @@ def test_its_history_fills_as_the_training_s_does(example: Any) -> None:
     assert seen[14][0][:, 0].tolist() == [float(i) for i in range(2, 15)]
 
 
-def test_its_tool_point_is_that_of_the_kinematics(example: Any, machine: Machine) -> None:
+def test_its_tool_point_is_that_of_the_kinematics(example: Any) -> None:
     policy = example.ExportedPolicy(ROOT / "tasks/policies/borehole_insertion")
-    q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (50, machine.num_joints))
-    pose = Kinematics(machine).pose(torch.tensor(q, dtype=torch.float32))
+    q = np.random.default_rng(0).uniform(MACHINE.lower, MACHINE.upper, (50, MACHINE.num_joints))
+    pose = Kinematics(MACHINE).pose(torch.tensor(q, dtype=torch.float32))
     for row, tip_m, pitch_rad in zip(q, pose.tip_in_base_m, pose.pitch_rad, strict=True):
         found_m, found_rad = policy.locate_tip(row)
         assert found_m == pytest.approx(tip_m.numpy(), abs=1e-5)
         assert found_rad == pytest.approx(float(pitch_rad), abs=1e-5)
 
 
-def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
+def test_it_ends_where_the_task_does(example: Any) -> None:
     """Random holes near the tool: success where the task's own judgement says so."""
     policy = example.ExportedPolicy(ROOT / "tasks/policies/borehole_insertion")
     task: Any = option("task", "borehole_insertion")
-    q = machine.home
+    q = MACHINE.home
     tip_m, _ = policy.locate_tip(q)
     generator = np.random.default_rng(1)
     outcomes = set()
@@ -98,5 +97,5 @@ def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
     assert outcomes == {True, False}
     far_m = tip_m + 1.0
     assert policy.find_end(far_m, q, 19.9) is None and policy.find_end(far_m, q, 20.0) == "time"
-    assert policy.find_end(far_m, machine.upper - 0.009, 0.0) == "joint limit"
-    assert policy.find_end(far_m, machine.upper - 0.011, 0.0) is None
+    assert policy.find_end(far_m, MACHINE.upper - 0.009, 0.0) == "joint limit"
+    assert policy.find_end(far_m, MACHINE.upper - 0.011, 0.0) is None

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 
 from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
@@ -26,16 +26,16 @@ def moved(segment: Segment) -> set[int]:
     return set(np.flatnonzero(np.abs(segment.u).max(0)).tolist())
 
 
-def test_start_poses_load_each_joint_from_both_sides_where_gravity_can(machine: Machine) -> None:
+def test_start_poses_load_each_joint_from_both_sides_where_gravity_can() -> None:
     """Four poses show every sign there is."""
     generator = np.random.default_rng(0)
 
     def find_signs(q: np.ndarray) -> list[set[float]]:
-        signs = np.sign(np.round(Gravity(machine).load(q)))
+        signs = np.sign(np.round(Gravity(MACHINE).load(q)))
         return [set(column) for column in signs.T.tolist()]
 
-    anywhere = find_signs(generator.uniform(machine.lower, machine.upper, (500, 5)))
-    chosen = draw_start_poses(machine, 0.06, generator)
+    anywhere = find_signs(generator.uniform(MACHINE.lower, MACHINE.upper, (500, 5)))
+    chosen = draw_start_poses(MACHINE, 0.06, generator)
     for _ in range(5):
         assert find_signs(np.stack([next(chosen) for _ in range(4)])) == anywhere
 
@@ -50,32 +50,30 @@ def test_a_machine_without_bodies_starts_anywhere_within_its_margins() -> None:
             assert (segment.start <= bare.upper - margin).all()
 
 
-def test_sines_are_one_segment_a_joint_of_whole_waves_from_home(machine: Machine) -> None:
-    found = segments("sine", machine, 900.0)
-    names = [f"sine_{joint}" for joint in machine.joint_names]
+def test_sines_are_one_segment_a_joint_of_whole_waves_from_home() -> None:
+    found = segments("sine", MACHINE, 900.0)
+    names = [f"sine_{joint}" for joint in MACHINE.joint_names]
     assert sorted(segment.name for segment in found) == names
     for segment in found:
         (joint,) = moved(segment)
-        assert segment.name.endswith(machine.joint_names[joint]) and segment.stops == "home"
-        assert (segment.start == machine.home).all() and len(segment.u) == 3600  # 180 s at 20 Hz
+        assert segment.name.endswith(MACHINE.joint_names[joint]) and segment.stops == "home"
+        assert (segment.start == MACHINE.home).all() and len(segment.u) == 3600  # 180 s at 20 Hz
         u = segment.u[:, joint]
         assert u[0] == 0 and 0.1 < np.abs(u).max() <= 1.0
-        assert abs(u.sum() * machine.period_s) < 0.1, "whole waves end where they began"
+        assert abs(u.sum() * MACHINE.period_s) < 0.1, "whole waves end where they began"
 
 
-def test_the_waves_keep_to_their_band(machine: Machine) -> None:
+def test_the_waves_keep_to_their_band() -> None:
     band = {"lowest_hz": 0.2, "highest_hz": 0.25, "smallest": 0.5, "largest": 0.6}
-    segment = segments("sine", machine, 600.0, **band)[0]
+    segment = segments("sine", MACHINE, 600.0, **band)[0]
     u = segment.u[:, moved(segment).pop()]
     rising = np.flatnonzero((u[:-1] < 0) & (u[1:] >= 0))
     assert 0.45 < np.abs(u).max() <= 0.6
     assert np.median(np.diff(rising)) == pytest.approx(20 / 0.225, rel=0.15)
 
 
-def test_levels_move_several_joints_at_once_and_exclusive_ones_by_themselves(
-    machine: Machine,
-) -> None:
-    found = segments("levels", machine, 600.0)
+def test_levels_move_several_joints_at_once_and_exclusive_ones_by_themselves() -> None:
+    found = segments("levels", MACHINE, 600.0)
     assert len(found) == 10 and all(len(segment.u) == 1200 for segment in found)
     u = np.concatenate([segment.u for segment in found])
     others = np.delete(u, 1, axis=1)
@@ -86,58 +84,58 @@ def test_levels_move_several_joints_at_once_and_exclusive_ones_by_themselves(
     assert all((segment.u[:, 1] != 0).any() for segment in found)
 
 
-def test_ramps_cross_zero_at_each_slope_in_both_directions(machine: Machine) -> None:
-    found = segments("ramps", machine, 1200.0, reach=0.3)
+def test_ramps_cross_zero_at_each_slope_in_both_directions() -> None:
+    found = segments("ramps", MACHINE, 1200.0, reach=0.3)
     slopes = {}
     for segment in found:
         (joint,) = moved(segment)
         u = segment.u[:, joint]
         middle = len(u) // 2
-        slopes.setdefault(joint, set()).add(round(float(np.diff(u)[middle]) / machine.period_s, 2))
+        slopes.setdefault(joint, set()).add(round(float(np.diff(u)[middle]) / MACHINE.period_s, 2))
         assert u[0] == u[-1] == 0 and u[middle] == pytest.approx(0.0, abs=1e-12)
-        way = np.abs(np.cumsum(u)).max() * machine.period_s * machine.max_speed[joint]
-        assert way <= 0.32 * (machine.upper - machine.lower)[joint]
+        way = np.abs(np.cumsum(u)).max() * MACHINE.period_s * MACHINE.max_speed[joint]
+        assert way <= 0.32 * (MACHINE.upper - MACHINE.lower)[joint]
     assert set(slopes) == set(range(5))
     seen = set().union(*slopes.values())
     assert {round(abs(slope), 2) for slope in seen} == {0.05, 0.1, 0.2}
     assert min(seen) < 0 < max(seen)
 
 
-def test_holds_are_still_in_poses_of_different_load(machine: Machine) -> None:
-    found = segments("holds", machine, 100.0)
+def test_holds_are_still_in_poses_of_different_load() -> None:
+    found = segments("holds", MACHINE, 100.0)
     assert [len(segment.u) for segment in found] == [500] * 4
     assert not any(segment.u.any() for segment in found)
     assert len({tuple(segment.start) for segment in found}) == 4
 
 
-def test_reversals_come_back(machine: Machine) -> None:
-    for segment in segments("reversals", machine, 120.0):
+def test_reversals_come_back() -> None:
+    for segment in segments("reversals", MACHINE, 120.0):
         (joint,) = moved(segment)
         assert segment.u[:, joint].sum() == pytest.approx(0.0)
         assert (np.diff(np.sign(segment.u[:, joint])) == -2).sum() >= 12
 
 
-def test_an_excitation_that_finds_no_room_says_so(machine: Machine) -> None:
+def test_an_excitation_that_finds_no_room_says_so() -> None:
     for name in ("holds", "ramps", "reversals", "sine"):
         with pytest.raises(ConfigError, match=f"excitation={name}.*raise collect.run_minutes"):
-            segments(name, machine, 5.0)
+            segments(name, MACHINE, 5.0)
 
 
 @pytest.mark.parametrize("name", ["sine", "levels", "ramps", "reversals", "work"])
-def test_another_seed_draws_others(name: str, machine: Machine) -> None:
-    one, other = (segments(name, machine, 300.0, seed) for seed in (1, 2))
+def test_another_seed_draws_others(name: str) -> None:
+    one, other = (segments(name, MACHINE, 300.0, seed) for seed in (1, 2))
     first, second = (np.concatenate([part.u for part in found]) for found in (one, other))
     assert not np.array_equal(first, second)
 
 
-def test_a_person_at_work_ramps_few_levers_and_corrects_after_a_stroke(machine: Machine) -> None:
+def test_a_person_at_work_ramps_few_levers_and_corrects_after_a_stroke() -> None:
     fields = {"ramp_s": 0.5, "level": (0.9, 0.9), "corrections": 3, "correction_level": (0.2, 0.3)}
-    played = segments("work", machine, 600.0, **fields)
+    played = segments("work", MACHINE, 600.0, **fields)
     u = np.concatenate([segment.u for segment in played])
     moving = np.abs(u) > 0
     assert moving.sum(1).max() == 2
-    exclusive = moving[:, machine.is_exclusive].any(1)
-    assert exclusive.any() and not moving[exclusive][:, ~machine.is_exclusive].any()
+    exclusive = moving[:, MACHINE.is_exclusive].any(1)
+    assert exclusive.any() and not moving[exclusive][:, ~MACHINE.is_exclusive].any()
     # A stroke of 0.9 takes 0.5 s to ramp, a correction of 0.3 half of its 0.2 s: no jump.
     assert max(np.abs(np.diff(segment.u, axis=0)).max() for segment in played) < 0.31
     turned = (u[:-1] * u[1:] < 0).sum() + ((u[:-2] * u[2:] < 0) & (u[1:-1] == 0)).sum()

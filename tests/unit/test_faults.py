@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 import torch
 import training as runs
-from composed import option
+from composed import MACHINE, option
 
-from brokk_rl.machine import Machine
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
@@ -26,11 +25,11 @@ WILD = 2
 
 @pytest.mark.parametrize("sim", [NATIVE, FUSED], ids=["native", "warp"])
 def test_why_a_world_diverged_is_named_after_it_has_begun_anew(
-    machine: Machine, sim: NativeSimulator | WarpSimulator
+    sim: NativeSimulator | WarpSimulator,
 ) -> None:
-    world = sim.build(machine, "cpu")
-    home = torch.tensor(machine.home, dtype=torch.float32).repeat(4, 1)
-    increment = torch.zeros(4, machine.num_joints)
+    world = sim.build(MACHINE, "cpu")
+    home = torch.tensor(MACHINE.home, dtype=torch.float32).repeat(4, 1)
+    increment = torch.zeros(4, MACHINE.num_joints)
     world.step(increment)
     increment[WILD, 3] = float("nan")
     world.step(increment)
@@ -42,23 +41,21 @@ def test_why_a_world_diverged_is_named_after_it_has_begun_anew(
     assert "not finite" not in world.explain_faults()
 
 
-def test_a_full_buffer_is_named(machine: Machine) -> None:
-    world = replace(FUSED, num_constraints=1).build(machine, "cpu")
-    low = torch.tensor(machine.lower, dtype=torch.float32).repeat(4, 1) - 0.05  # every limit
+def test_a_full_buffer_is_named() -> None:
+    world = replace(FUSED, num_constraints=1).build(MACHINE, "cpu")
+    low = torch.tensor(MACHINE.lower, dtype=torch.float32).repeat(4, 1) - 0.05  # every limit
     world.reset(torch.ones(4, dtype=torch.bool), low, make_nominal_scenes(4))
     world.step(torch.zeros_like(low))
     assert "sim.num_constraints" in world.explain_faults()
 
 
-def make_loop(machine: Machine, task: Any = None) -> ControlLoop:
+def make_loop(task: Any = None) -> ControlLoop:
     torch.manual_seed(0)
-    return runs.plant(machine, task, NATIVE).build(runs.CPU, 4, 64, 5)
+    return runs.plant(task, NATIVE).build(runs.CPU, 4, 64, 5)
 
 
-def test_a_training_counts_and_names_faults(
-    machine: Machine, caplog: pytest.LogCaptureFixture
-) -> None:
-    loop = make_loop(machine)
+def test_a_training_counts_and_names_faults(caplog: pytest.LogCaptureFixture) -> None:
+    loop = make_loop()
     loop.step(torch.zeros(4, 5))
     assert loop.statistics()["fault_rate"] == 0.0
     loop.world._drive.reference[WILD, 0] = float("nan")  # type: ignore[attr-defined]
@@ -71,10 +68,10 @@ def divide_by_zero(state: StepState) -> torch.Tensor:
     return (state.u - state.u_before).abs().sum(1) / 0.0
 
 
-def test_a_reward_term_that_is_not_finite_is_told_from_the_others(machine: Machine) -> None:
+def test_a_reward_term_that_is_not_finite_is_told_from_the_others() -> None:
     task = option("task", "borehole_insertion")
     broken = RewardTerm(function=f"{__name__}:divide_by_zero", weight=-0.01)
-    loop = make_loop(machine, replace(task, reward=task.reward | {"command_change": broken}))
+    loop = make_loop(replace(task, reward=task.reward | {"command_change": broken}))
     loop.step(torch.zeros(4, 5))  # 0 / 0
     found = loop.statistics()
     odd = [name for name, value in found.items() if not math.isfinite(value)]

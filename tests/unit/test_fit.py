@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from axis import driven
-from composed import option
+from composed import MACHINE, option
 from safetensors.torch import load_file
 
 from actuators.contracts import FitTask
@@ -43,25 +43,25 @@ def weights(folder: Path, name: str) -> dict[str, torch.Tensor]:
 
 
 @pytest.fixture(scope="module")
-def runs(machine: Machine) -> Runs:
+def runs() -> Runs:
     """Recordings to fit to and to stop by."""
-    return [recording(machine, seed) for seed in range(2)], [recording(machine, 9)]
+    return [recording(MACHINE, seed) for seed in range(2)], [recording(MACHINE, 9)]
 
 
-def test_a_fit_repeats_with_its_seed(machine: Machine, runs: Runs, tmp_path: Path) -> None:
+def test_a_fit_repeats_with_its_seed(runs: Runs, tmp_path: Path) -> None:
     for folder, seed in (("a", 1), ("b", 1), ("c", 2)):
-        tiny("mlp").fit(FitTask(machine, *runs, tmp_path / folder, seed))
+        tiny("mlp").fit(FitTask(MACHINE, *runs, tmp_path / folder, seed))
     a, b, c = (weights(tmp_path / folder, "mlp") for folder in "abc")
     assert all(torch.equal(a[key], b[key]) for key in a)
     assert not torch.equal(a["weight.0"], c["weight.0"])
 
 
-def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:
-    parts = [recording(machine, seed, minutes=0.2) for seed in range(3)]
+def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings() -> None:
+    parts = [recording(MACHINE, seed, minutes=0.2) for seed in range(3)]
     marked = []
     for number, part in enumerate(parts):
         marked.append(dataclasses.replace(part, q=np.full_like(part.q, number)))
-    windows = TrainingWindows(marked, machine, 7, CPU)
+    windows = TrainingWindows(marked, MACHINE, 7, CPU)
     draws = [windows.draw(64, 0.25, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
     assert torch.equal(draws[0][0], draws[1][0])
@@ -74,10 +74,8 @@ def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings(machin
 
 
 @pytest.mark.parametrize(("noise", "step"), [(2e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
-def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(
-    machine: Machine, noise: float, step: float
-) -> None:
-    made = recording(machine, minutes=10.0)
+def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(noise: float, step: float) -> None:
+    made = recording(MACHINE, minutes=10.0)
     u = made.u.copy()
     u[: u.shape[0] // 2] = 0.0
     q = made.q.copy()
@@ -85,14 +83,14 @@ def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(
     if step:
         q = np.round(q / step) * step
     found = network_fit.estimate_resting_noise(
-        [dataclasses.replace(made, u=u, q=q.astype(np.float32))], machine
+        [dataclasses.replace(made, u=u, q=q.astype(np.float32))], MACHINE
     )
     assert found == pytest.approx(step / 6**0.5 if step else noise * 2**0.5, rel=0.05)
 
 
-def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> None:
-    part = recording(machine, minutes=2.0)
+def test_too_little_data_says_how_much_and_of_which_joint() -> None:
+    part = recording(MACHINE, minutes=2.0)
     u = part.u.copy()
     u[:, 2] = np.minimum(u[:, 2], 0.0)
     with pytest.raises(RecordingError, match=r"q3 0\.0 min forth and .* needed are 0\.25 min"):
-        network_fit.check_enough([dataclasses.replace(part, u=u)], machine)
+        network_fit.check_enough([dataclasses.replace(part, u=u)], MACHINE)

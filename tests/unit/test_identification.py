@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from axis import driven
-from composed import option
+from composed import MACHINE, option
 
 from actuators.contracts import FitTask
 from actuators.identify import page
@@ -21,7 +21,6 @@ from actuators.models.linear import Hold
 from actuators.modes.identify import Identify
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
-from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
@@ -34,7 +33,7 @@ PLANT = FirstOrderLag(
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six runs of 30 s of random levels on all joints, two files each."""
     folder = tmp_path_factory.mktemp("recordings")
-    for run, made in enumerate(driven(option("machine", "brokk170"), 6, 30.0, 0, PLANT, 0.0)):
+    for run, made in enumerate(driven(MACHINE, 6, 30.0, 0, PLANT, 0.0)):
         for part in range(2):
             rows = slice(300 * part, 300 * part + 300)
             half = {"t_s": made.t_s[rows], "u": made.u[rows], "q": made.q[rows]}
@@ -68,12 +67,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "write_page", lambda *arguments: None)
 
 
-def identify(
-    machine: Machine, out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any
-) -> Identify:
+def identify(out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any) -> Identify:
     own = {"recordings": f"{folder}/*", "test": None, "folds": None, "hold_out": 3, "stride_s": 1.0}
     return Identify(
-        session=Session(out=str(out), seed=0, device="cpu"), machine=machine, fit=fit,
+        session=Session(out=str(out), seed=0, device="cpu"), machine=MACHINE, fit=fit,
         baselines={"hold": option("fit", "hold"), "arx": option("fit", "arx")},
         identify=Identification(**own | options), resume=str(out) if resume else None,
     )  # fmt: skip
@@ -87,10 +84,10 @@ def run(mode: Identify) -> dict[str, Any]:
 
 @pytest.mark.usefixtures("undrawn")
 def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(
-    machine: Machine, recordings: Path, tmp_path: Path
+    recordings: Path, tmp_path: Path
 ) -> None:
     fit = Fit()
-    result = run(identify(machine, tmp_path / "out", recordings, fit, folds=3))
+    result = run(identify(tmp_path / "out", recordings, fit, folds=3))
     every = {f"run {n}" for n in range(6)}
     stages = result["data"]["runs"]
     assert sorted(name for stage in stages for name in stage["test"]) == sorted(every)
@@ -106,25 +103,23 @@ def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(
 
 @pytest.mark.usefixtures("undrawn")
 def test_an_interrupted_identification_goes_on_and_does_no_fit_twice(
-    machine: Machine, recordings: Path, tmp_path: Path
+    recordings: Path, tmp_path: Path
 ) -> None:
-    whole = run(identify(machine, tmp_path / "whole", recordings, Fit(), folds=3))
+    whole = run(identify(tmp_path / "whole", recordings, Fit(), folds=3))
     broken = Fit(interrupted_at=2)
     with pytest.raises(KeyboardInterrupt):
-        run(identify(machine, tmp_path / "parts", recordings, broken, folds=3))
+        run(identify(tmp_path / "parts", recordings, broken, folds=3))
     again = Fit()
-    parts = run(identify(machine, tmp_path / "parts", recordings, again, resume=True, folds=3))
+    parts = run(identify(tmp_path / "parts", recordings, again, resume=True, folds=3))
     assert len(broken.fitted_to) == 2 and len(again.fitted_to) == 2
     assert all(parts[key] == whole[key] for key in ("joints", "overall", "against", "delay_s"))
     others = {"resume": True, "folds": 3, "stride_s": 2.0}
     with pytest.raises(StorageError, match="is of another fit, or of other recordings or windows"):
-        run(identify(machine, tmp_path / "parts", recordings, Fit(), **others))
+        run(identify(tmp_path / "parts", recordings, Fit(), **others))
 
 
-def test_going_on_needs_the_folder_itself_and_a_run_in_it(
-    machine: Machine, recordings: Path, tmp_path: Path
-) -> None:
-    mode = identify(machine, tmp_path / "none", recordings, Fit(), resume=True)
+def test_going_on_needs_the_folder_itself_and_a_run_in_it(recordings: Path, tmp_path: Path) -> None:
+    mode = identify(tmp_path / "none", recordings, Fit(), resume=True)
     with pytest.raises(ConfigError, match="there is no run to go on with"):
         run(mode)
     elsewhere = Identify(**{**vars(mode), "resume": str(tmp_path / "other")})
@@ -132,21 +127,17 @@ def test_going_on_needs_the_folder_itself_and_a_run_in_it(
         run(elsewhere)
 
 
-def test_a_run_is_refused_as_test_when_it_was_fitted_to(
-    machine: Machine, recordings: Path, tmp_path: Path
-) -> None:
+def test_a_run_is_refused_as_test_when_it_was_fitted_to(recordings: Path, tmp_path: Path) -> None:
     seen: dict[str, Any] = {"recordings": f"{recordings}/*_0.parquet"}
     seen["test"] = f"{recordings}/run0_1.parquet"
     with pytest.raises(RecordingError, match=r"run 0 is also among identify\.recordings"):
-        run(identify(machine, tmp_path / "a", recordings, Fit(), **seen))
+        run(identify(tmp_path / "a", recordings, Fit(), **seen))
     with pytest.raises(ConfigError, match="folds and test are two ways"):
-        identify(machine, tmp_path / "a", recordings, Fit(), test="x", folds=2)
+        identify(tmp_path / "a", recordings, Fit(), test="x", folds=2)
 
 
-def test_the_report_of_a_good_model_says_so(
-    machine: Machine, recordings: Path, tmp_path: Path
-) -> None:
-    result = run(identify(machine, tmp_path / "out", recordings, Fit()))
+def test_the_report_of_a_good_model_says_so(recordings: Path, tmp_path: Path) -> None:
+    result = run(identify(tmp_path / "out", recordings, Fit()))
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {
         "identification.json", "identification.html", "prediction.png",
     }  # fmt: skip
@@ -156,14 +147,12 @@ def test_the_report_of_a_good_model_says_so(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_model_that_stands_still_is_no_good_news(
-    machine: Machine, recordings: Path, tmp_path: Path
-) -> None:
-    result = run(identify(machine, tmp_path / "out", recordings, Fit(Hold())))
+def test_a_model_that_stands_still_is_no_good_news(recordings: Path, tmp_path: Path) -> None:
+    result = run(identify(tmp_path / "out", recordings, Fit(Hold())))
     verdict = result["verdict"][0]
     assert verdict["tone"] == "bad" and "worse on q1, q2, q3, q4, q5" in verdict["text"]
     result["delay_s"]["q4"] |= {"value": 0.8, "ci95": [0.78, 0.82]}
-    texts = [finding.text for finding in write_verdict(result, machine)]
+    texts = [finding.text for finding in write_verdict(result, MACHINE)]
     for part in (
         "dead time of q4 may exceed the history of 0.65 s",
         "num_history of machine 'brokk170' to 19 or more",

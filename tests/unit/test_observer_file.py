@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 from conftest import Brokk
 from motion import build_nominal_tables, make_recording
 
@@ -18,7 +18,6 @@ from brokk_rl.record import Recording, write_recording
 from deploy.guard_setup import build_observer, is_from_machine, read_observer_content
 from deploy.observer_file import FILE, ThresholdSettings, count_alarms, find_thresholds
 
-MACHINE = option("machine", "brokk170")
 GUARD = option("guard", "default")
 SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
 SETTINGS = ThresholdSettings(window_s=1.0, share=0.25, least_slack_s=0.06, margin=1.5)

@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 import torch
 import training as runs
-from composed import option, own_task
+from composed import MACHINE, option, own_task
 from conftest import Brokk
 
 from brokk_rl.errors import CheckpointError, ConfigError
-from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.export import Export
 from brokk_rl.observation import ObservationPart
@@ -48,20 +47,20 @@ def direct(task: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def shallow(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shallow(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run folder of a short training that aims less deep."""
     folder = tmp_path_factory.mktemp("shallow")
     torch.manual_seed(0)
     training = runs.small(max_env_steps=2 * ITERATION)
-    loop = runs.plant(machine, insertion(depth_m=0.1)).build(CPU, 16, 64, 0)
-    runner = runs.make(machine, folder, training, loop)
+    loop = runs.plant(insertion(depth_m=0.1)).build(CPU, 16, 64, 0)
+    runner = runs.make(folder, training, loop)
     runner.run()
     actor, process = runner.alg.get_policy(), loop.task
     network = training.describe_network()
     plant = {"actuator": option("actuator", "lag")}
-    contract = describe_policy(network, process, loop.description, machine, **plant)
+    contract = describe_policy(network, process, loop.description, MACHINE, **plant)
     write_policy(folder, contract, actor.state_dict())
-    export_onnx(folder, actor, process, machine, contract, runner.record_answers())  # type: ignore[arg-type]
+    export_onnx(folder, actor, process, MACHINE, contract, runner.record_answers())  # type: ignore[arg-type]
     return folder
 
 
@@ -70,10 +69,10 @@ def test_a_policy_restores_the_behaviour_and_leaves_the_conditions(shallow: Path
     assert found == insertion(episode_s=40.0, depth_m=0.1)
 
 
-def test_advice_is_restored(machine: Machine) -> None:
+def test_advice_is_restored() -> None:
     advised = own_task(insertion(), str(SHIPPED.with_name("behind_a_person")))
     assert advised.advice.delay_s == (0.1, 0.5) and advised.classical.straight is False
-    assert advised.build(machine, 1, CPU).control.encoder.size == 198
+    assert advised.build(MACHINE, 1, CPU).control.encoder.size == 198
 
 
 def test_each_field_of_the_behaviour_counts() -> None:
@@ -105,7 +104,7 @@ def test_a_changed_or_foreign_description_is_refused() -> None:
 
 
 def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
-    shallow: Path, machine: Machine, tmp_path: Path
+    shallow: Path, tmp_path: Path
 ) -> None:
     """The figures of a policy do not depend on the words of the caller, nor on its neighbours."""
     how = Evaluation(episodes=8, seed=3, num_recorded=1, video=False)
@@ -116,10 +115,10 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
     shipped = TrainedPolicy(path=str(SHIPPED), task=own_task(default, str(SHIPPED)))
     classical = ClassicalPolicy(task=mine.task)
     policies: Any = {"shallow": mine, "shipped": shipped, "classical": classical}
-    by_default = evaluate_policies(runs.plant(machine, default), how, session, policies)
-    own = runs.plant(machine, insertion(episode_s=short, depth_m=0.1))
+    by_default = evaluate_policies(runs.plant(default), how, session, policies)
+    own = runs.plant(insertion(episode_s=short, depth_m=0.1))
     alone = evaluate_policies(own, how, session, {"shallow": mine})
-    other = evaluate_policies(runs.plant(machine, default), how, session, {"shipped": shipped})
+    other = evaluate_policies(runs.plant(default), how, session, {"shipped": shipped})
     assert by_default["policies"]["shallow"] == alone["policies"]["shallow"]
     assert by_default["policies"]["shipped"] == other["policies"]["shipped"]
     assert by_default["task"]["behaviour"]["depth_m"] == 0.1
@@ -127,13 +126,11 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
     assert stamps["shallow"] == stamps["classical"] != stamps["shipped"]
 
 
-def test_a_checkpoint_is_exported_by_what_it_says(
-    shallow: Path, machine: Machine, tmp_path: Path
-) -> None:
+def test_a_checkpoint_is_exported_by_what_it_says(shallow: Path, tmp_path: Path) -> None:
     """Its file answers as the training run recorded; another network or task is noticed."""
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     policy = TrainedPolicy(path=str(shallow), task=None)
-    export = Export(session=session, machine=machine, task=insertion(depth_m=0.1), policy=policy)
+    export = Export(session=session, machine=MACHINE, task=insertion(depth_m=0.1), policy=policy)
     export.run()
     made = json.loads((tmp_path / "policy.json").read_text())
     assert made["task"]["behaviour"]["depth_m"] == 0.1 and made["parity"]["observations"] == 16
@@ -152,10 +149,10 @@ def test_a_checkpoint_is_exported_by_what_it_says(
         replace(export, policy=other).run()
 
 
-def test_recorded_answers_are_those_of_the_network_in_the_loop(machine: Machine) -> None:
+def test_recorded_answers_are_those_of_the_network_in_the_loop() -> None:
     """Against the command in force after the step itself, and nothing changes by asking."""
     torch.manual_seed(0)
-    loop = runs.plant(machine, direct(insertion())).build(CPU, 8, 16, 0)
+    loop = runs.plant(direct(insertion())).build(CPU, 8, 16, 0)
 
     def act(groups: Any) -> torch.Tensor:
         return (groups["policy"][:, 3:8] + groups["guide"][:, :5]).tanh()
@@ -171,15 +168,15 @@ def test_recorded_answers_are_those_of_the_network_in_the_loop(machine: Machine)
     assert torch.equal(commands, loop.end_u[:5])
 
 
-def test_resuming_in_another_task_is_refused_by_name(shallow: Path, machine: Machine) -> None:
+def test_resuming_in_another_task_is_refused_by_name(shallow: Path) -> None:
     training = runs.small(max_env_steps=4 * ITERATION)
-    runner = runs.make(machine, shallow, training)
+    runner = runs.make(shallow, training)
     with pytest.raises(CheckpointError, match=r"task\.depth_m is 0\.1 there, 0\.14 here.*resolved"):
         runner.load(str(shallow / "model_2.pt"))
 
 
-def test_a_pitch_is_given_exactly_where_the_policy_asks_for_one(machine: Machine) -> None:
-    bundle = PolicyBundle(str(SHIPPED), machine)
+def test_a_pitch_is_given_exactly_where_the_policy_asks_for_one() -> None:
+    bundle = PolicyBundle(str(SHIPPED), MACHINE)
     bundle.check_pitch(None)
     with pytest.raises(ConfigError, match=r"deploy\.pitch_rad=1\.2 was asked for"):
         bundle.check_pitch(1.2)
@@ -212,7 +209,7 @@ def foreign(shallow: Path, tmp_path: Path) -> Path:
     shutil.copytree(shallow, folder)
     contract = json.loads((folder / "policy.json").read_text())
     contract["plant"]["machine"] |= {"name": "foreign", "title": "of somebody else"}
-    machine = replace(option("machine", "brokk170"), name="foreign")
+    machine = replace(MACHINE, name="foreign")
     contract |= {"machine": "foreign", "fingerprint": machine.fingerprint()}
     (folder / "policy.json").write_text(json.dumps(contract))
     return folder

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE
 from desk import build_feed
 
 from brokk_rl.errors import LinkError
@@ -27,7 +27,6 @@ from deploy.runtime.process_group import ProcessGroup
 from deploy.runtime.shm_layout import TEXT, LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
 
-MACHINE = option("machine", "brokk170")
 FULL_RAD = 0.35
 
 

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import TOKEN, served, talk, until
-from composed import option
+from composed import MACHINE, option
 from desk import DBC
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.kernel.guard import GuardState, GuardTrip
@@ -39,17 +38,17 @@ class Clock:
 
 
 @pytest.fixture(scope="module")
-def capture(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten seconds: q1 turns by 0.1 rad/s, the dead-man comes at 2 s, the guard latches at 4 s and the levers end at 8 s."""
     folder = tmp_path_factory.mktemp("capture")
-    bus = BusDescription(DBC, machine)
+    bus = BusDescription(DBC, MACHINE)
 
     def pack(name: str, values: dict[str, float], k: int) -> bytes:
         payload = bus.encode(name, values, k)
         header = FRAME.pack(BEGIN_S + 0.1 * k, bus.layouts[name].frame_id, 0, len(payload))
         return header + payload
 
-    with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 0.0)) as log:
+    with CaptureWriter(CaptureConfig(folder, DBC, MACHINE, {"source": "test"}, 0.0)) as log:
 
         def say(topic: str, at_s: float, **values: Any) -> None:
             log.add(TEXT + json.dumps({"topic": topic, "t_s": BEGIN_S + at_s, **values}).encode())
@@ -93,9 +92,9 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def feed(capture: Path, machine: Machine, clock: Clock) -> ReplayFeed:
+def feed(capture: Path, clock: Clock) -> ReplayFeed:
     replay: CaptureReplay = read_settings(capture)
-    return ReplayFeed(replay, machine, read_capture(capture / MCAP), clock)
+    return ReplayFeed(replay, MACHINE, read_capture(capture / MCAP), clock)
 
 
 def test_the_state_is_that_of_the_recording_at_the_time_on_the_timeline(
@@ -183,24 +182,24 @@ def test_a_recording_that_cannot_be_shown_is_refused(
     replay: CaptureReplay = read_settings(capture)
     if name == "nothing":
         with pytest.raises(RecordingError, match="no such capture"):
-            replace(replay, capture=str(tmp_path)).build(option("machine", "brokk170"))
+            replace(replay, capture=str(tmp_path)).build(MACHINE)
     else:
         with pytest.raises(RecordingError, match="machine"):
             replay.build(option("machine", name))
 
 
 def test_a_recording_without_guard_page_and_camera_can_be_shown(
-    machine: Machine, tmp_path: Path, clock: Clock
+    tmp_path: Path, clock: Clock
 ) -> None:
-    bus = BusDescription(DBC, machine)
-    with CaptureWriter(CaptureConfig(tmp_path, DBC, machine, {}, 0.0)) as log:
+    bus = BusDescription(DBC, MACHINE)
+    with CaptureWriter(CaptureConfig(tmp_path, DBC, MACHINE, {}, 0.0)) as log:
         for k in range(5):
             payload = bus.encode("JointPos1", {"Position_q1": 0.2, "Valid_q1": 1}, k)
             frame_id = bus.layouts["JointPos1"].frame_id
             header = FRAME.pack(BEGIN_S + 0.1 * k, frame_id, 0, len(payload))
             log.add(FRAMES + header + payload)
     found = read_settings(tmp_path)
-    shown = ReplayFeed(found, machine, read_capture(tmp_path / MCAP), clock).read_state()
+    shown = ReplayFeed(found, MACHINE, read_capture(tmp_path / MCAP), clock).read_state()
     assert shown.state is not None and shown.state.q[0] == pytest.approx(0.2, abs=1e-3)
     assert shown.insertion is None and shown.targets == () and not shown.commands
     assert np.isfinite(shown.state.q).all()

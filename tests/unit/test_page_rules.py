@@ -14,7 +14,7 @@ from typing import get_args
 import numpy as np
 import pytest
 from browser import SHOWN, TOKEN, change_state
-from composed import option
+from composed import MACHINE
 from conftest import Note
 from hypothesis import given
 from hypothesis import strategies as st
@@ -189,10 +189,9 @@ def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
 
 
 def test_the_tool_is_measured_along_and_across_the_axis_of_the_hole() -> None:
-    machine = option("machine", "brokk170")
     # q2 + q3 + q4 + q5 = pi/2 points the chisel straight down; the slew turns the view with it
     q = np.array([0.4, -0.9, 0.6, 1.2, np.pi / 2 - 0.9])
-    tool = compute_tool_kinematics(machine, q)
+    tool = compute_tool_kinematics(MACHINE, q)
     ahead, left = np.array([np.cos(0.4), np.sin(0.4), 0]), np.array([-np.sin(0.4), np.cos(0.4), 0])
     rim_m = tool.tip_in_base_m + 0.02 * ahead - 0.01 * left + np.array([0, 0, 0.12])
     up = (0.0, 0.0, 1.0)
@@ -205,7 +204,7 @@ def test_the_tool_is_measured_along_and_across_the_axis_of_the_hole() -> None:
     assert found.center_in_view_m == pytest.approx((0.01, 0.02, -0.12)), "right, up, ahead"
     assert found.axis_in_view == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
     # leaning outwards by 0.1 rad about the tip: the hole's axis then leans towards the machine
-    leaning = measure_insertion(compute_tool_kinematics(machine, q - [0, 0, 0, 0, 0.1]), hole)
+    leaning = measure_insertion(compute_tool_kinematics(MACHINE, q - [0, 0, 0, 0, 0.1]), hole)
     assert leaning.angle_rad == pytest.approx(0.1)
     assert leaning.axis_in_view[1] == pytest.approx(math.sin(0.1))
     beside = replace(hole, radius_m=0.02)

@@ -29,7 +29,6 @@ from perception.modes.board import draw_board
 from perception.modes.score_camera import match_found_holes
 from perception.render.board_on_arm import BoardOnArm, BoardScenes
 from perception.render.frame_renderer import FrameRenderer
-from perception.render.stereo_camera import StereoRig
 
 POINTS_PER_M = 72.0 / 0.0254
 
@@ -106,9 +105,7 @@ def test_a_board_that_cannot_be_drawn_is_refused() -> None:
 SESSION = Session(out=".", seed=4, device="cpu")
 
 
-@pytest.fixture(scope="module")
-def rig() -> StereoRig:
-    return option("rig", "zed_2i_720p")
+RIG = option("rig", "zed_2i_720p")
 
 
 def find_corners(board: Charuco, studio: FrameRenderer, scenes: Any, number: int) -> Any:
@@ -119,11 +116,11 @@ def find_corners(board: Charuco, studio: FrameRenderer, scenes: Any, number: int
     return *board.find_corners(frame), scene, shot
 
 
-def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path: Path) -> None:
+def test_a_board_on_the_arm_is_where_the_recording_says(tmp_path: Path) -> None:
     kind: BoardOnArm = option("scene", "board_on_arm")
-    scenes = BoardScenes(kind, rig, SESSION)
+    scenes = BoardScenes(kind, RIG, SESSION)
     studio = FrameRenderer(
-        rig=rig, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
+        rig=RIG, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
     )
     corners_m, corners_px, scene, _ = find_corners(kind.board, studio, scenes, 3)
     assert len(corners_m) > 20
@@ -137,7 +134,7 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     link = compute_link_poses(kind.machine, q).base_from_link
     plates: list[Any] = [scenes.compose(number)[0].solids for number in (3, 1)]
     at = [next(one.pose.center_m for one in solids if one.role == "board") for solids in plates]
-    base = rig.base_from_camera
+    base = RIG.base_from_camera
     in_base = [base[:3, :3] @ one + base[:3, 3] for one in at]
     on_link = link[0][:3, :3].T @ (in_base[0] - link[0][:3, 3])
     predicted = link[1][:3, :3] @ on_link + link[1][:3, 3]
@@ -147,7 +144,7 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     plate: Any = next(one for one in scene.solids if one.role == "board")
     size_m = np.array([kind.board.columns, kind.board.rows]) * kind.board.square_m
     local = corners_m - [*(size_m / 2), plate.half_m[2]]
-    expected = rig.left.project(plate.pose.point(local))
+    expected = RIG.left.project(plate.pose.point(local))
     # A shadow's edge moves one corner by half a pixel.
     away_px = expected - corners_px
     assert np.median(np.linalg.norm(away_px, axis=1)) < 0.15

@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from composed import option
+from composed import MACHINE, option
 from conftest import Brokk
 from drawn import K, drawn
 from motion import make_recording
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import FrameError
-from brokk_rl.machine import Machine
 from brokk_rl.record import write_recording
 from brokk_rl.signals import Frame
 from perception import dataset
@@ -49,12 +48,12 @@ def opencv(views: Any) -> np.ndarray:
 
 @pytest.mark.parametrize(("zero_deg", "count", "wrong"), [(0.1, 30, 0.0), (0.5, 60, 0.15)])
 def test_a_poor_arm_and_wrong_sights_leave_millimetres(
-    zero_deg: float, count: int, wrong: float, machine: Machine
+    zero_deg: float, count: int, wrong: float
 ) -> None:
     ours, theirs, surprise = [], [], []
     for seed in range(6):
-        poses = board.posed(machine, count, seed, np.radians(zero_deg), 0.001, 0.0005)
-        views, bad = board.views(machine, poses, EXACT, seed, wrong)
+        poses = board.posed(MACHINE, count, seed, np.radians(zero_deg), 0.001, 0.0005)
+        views, bad = board.views(MACHINE, poses, EXACT, seed, wrong)
         found = hand_eye.solve_hand_eye(views)
         assert found is not None and not (bad & found.used).any()
         assert (~bad & ~found.used).sum() <= 1
@@ -70,9 +69,9 @@ def test_a_poor_arm_and_wrong_sights_leave_millimetres(
     assert 2.0 < np.mean(surprise) < 12.0
 
 
-def test_of_two_poses_that_fit_the_corners_the_arm_chooses(machine: Machine) -> None:
-    poses = board.posed(machine, 20, 3, 0.0, 0.001, 0.0005)
-    views, _ = board.views(machine, poses, EXACT, 3)
+def test_of_two_poses_that_fit_the_corners_the_arm_chooses() -> None:
+    poses = board.posed(MACHINE, 20, 3, 0.0, 0.001, 0.0005)
+    views, _ = board.views(MACHINE, poses, EXACT, 3)
     flip = transforms.make_transform(Rotation.from_rotvec([0.7, 0.3, 0.0]).as_matrix(), np.zeros(3))
     both = np.stack([views.camera_from_board[:, 0], views.camera_from_board[:, 0] @ flip], 1)
     swapped = np.arange(20) % 2 == 0
@@ -85,7 +84,7 @@ def test_of_two_poses_that_fit_the_corners_the_arm_chooses(machine: Machine) -> 
 
 
 def swing(
-    machine: Machine, offset_s: float, moving: bool = True
+    offset_s: float, moving: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns times and turns of frames, times and positions of a recording in which the arm starts and stops."""
     t_s = np.arange(0.0, 20.0, 0.05)
@@ -93,7 +92,7 @@ def swing(
     q = board.MIDDLE + moving * np.outer(phase, [0.3, 0.1, -0.2, 0.3, 0.2])
     frame_s = np.arange(1.0, 18.0, 1 / 15)
     there = np.stack([np.interp(frame_s + offset_s, t_s, column) for column in q.T], 1)
-    return frame_s, arm.compute_link_poses(machine, there).base_from_link[:, :3, :3], t_s, q
+    return frame_s, arm.compute_link_poses(MACHINE, there).base_from_link[:, :3, :3], t_s, q
 
 
 def shake(turns: np.ndarray) -> np.ndarray:
@@ -102,26 +101,24 @@ def shake(turns: np.ndarray) -> np.ndarray:
     return turns @ Rotation.from_rotvec(away_rad).as_matrix()
 
 
-def estimate_offset(machine: Machine, frame_s: Any, turns: Any, t_s: Any, q: Any) -> Any:
-    link = arm.compute_link_poses(machine, q).base_from_link[:, :3, :3]
+def estimate_offset(frame_s: Any, turns: Any, t_s: Any, q: Any) -> Any:
+    link = arm.compute_link_poses(MACHINE, q).base_from_link[:, :3, :3]
     return clock_offset.estimate_clock_offset(frame_s, turns, t_s, link, 1.0, 0.4)
 
 
 @pytest.mark.parametrize("offset_s", [-0.31, 0.0, 0.08, 0.64])
-def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(
-    offset_s: float, machine: Machine
-) -> None:
-    frame_s, turns, t_s, q = swing(machine, offset_s)
+def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(offset_s: float) -> None:
+    frame_s, turns, t_s, q = swing(offset_s)
     # Nobody knows how the camera and the board are turned.
     turns = Rotation.from_rotvec([0.4, 1.0, -0.3]).as_matrix() @ shake(turns)
-    found = estimate_offset(machine, frame_s, turns, t_s, q)
+    found = estimate_offset(frame_s, turns, t_s, q)
     assert found is not None and found.correlation > 0.6
     assert found.offset_s == pytest.approx(offset_s, abs=0.02)
 
 
-def test_an_arm_that_rests_tells_nothing_about_clocks(machine: Machine) -> None:
-    frame_s, turns, t_s, q = swing(machine, 0.1, moving=False)
-    found = estimate_offset(machine, frame_s, shake(turns), t_s, q)
+def test_an_arm_that_rests_tells_nothing_about_clocks() -> None:
+    frame_s, turns, t_s, q = swing(0.1, moving=False)
+    found = estimate_offset(frame_s, shake(turns), t_s, q)
     assert found is None or found.correlation < 0.4
     still = turns[:1].repeat(len(t_s), 0)
     few = clock_offset.estimate_clock_offset(frame_s[:9], turns[:9], t_s, still, 1.0, 0.4)
@@ -144,7 +141,7 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, chance = tmp_path_factory.mktemp("board"), np.random.default_rng(0)
     other, right = np.random.default_rng(1), np.eye(4)
     right[0, 3] = -BASELINE_M
-    poses = board.posed(option("machine", "brokk170"), 16, 0, 0.002, 0.001, 0.0005)
+    poses = board.posed(MACHINE, 16, 0, 0.002, 0.001, 0.0005)
     write_camera(folder, CameraModel(board.MATRIX, None, BASELINE_M, (1280, 720)))
     for number, there in enumerate(poses.camera_from_board):
         dataset.write_picture(folder / f"{number:03d}.color.png", board.picture(there, chance))
@@ -208,18 +205,16 @@ def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
 
 
 @pytest.mark.slow
-def test_a_board_filmed_while_the_arm_moves_is_enough(
-    brokk: Brokk, machine: Machine, tmp_path: Path
-) -> None:
-    poses, t_s = board.posed(machine, 12, 1), np.arange(0.0, 14.0, 0.05)
+def test_a_board_filmed_while_the_arm_moves_is_enough(brokk: Brokk, tmp_path: Path) -> None:
+    poses, t_s = board.posed(MACHINE, 12, 1), np.arange(0.0, 14.0, 0.05)
     # Of each second, 0.6 s on the way to the next pose.
     eased = np.floor(t_s) + np.clip((t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0)
     q = np.stack([np.interp(eased, np.arange(12.0), column) for column in poses.q.T], 1)
-    write_recording(make_recording(machine, np.zeros_like(q), q), tmp_path / "run.parquet")
+    write_recording(make_recording(MACHINE, np.zeros_like(q), q), tmp_path / "run.parquet")
     frame_s, late_s, chance = np.arange(0.5, 11.5, 0.4), 0.12, np.random.default_rng(0)
     write_camera(tmp_path, CameraModel(board.MATRIX, size_px=(1280, 720)))
     there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
-    for number, link in enumerate(arm.compute_link_poses(machine, there).base_from_link):
+    for number, link in enumerate(arm.compute_link_poses(MACHINE, there).base_from_link):
         seen = np.linalg.inv(board.CAMERA) @ link @ poses.link_from_board
         dataset.write_picture(tmp_path / f"{number:03d}.color.png", board.picture(seen, chance))
     source = (f"calibration.source.folder={tmp_path}", "calibration.source.rate_hz=2.5")
@@ -232,12 +227,12 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
     assert mm < 4.0 and degrees < 0.1
 
 
-def judged(machine: Machine, joint: int, factor: float) -> evaluation.Verdict:
+def judged(joint: int, factor: float) -> evaluation.Verdict:
     """Returns the verdict on true sights of the board beside positions of which one joint is scaled."""
-    poses = board.posed(machine, 30, joint, 0.0044, 0.0017, 0.001)
+    poses = board.posed(MACHINE, 30, joint, 0.0044, 0.0017, 0.001)
     q = poses.q.copy()
     q[:, joint] *= factor
-    views = board.views(machine, replace(poses, q=q), EXACT, joint)[0]
+    views = board.views(MACHINE, replace(poses, q=q), EXACT, joint)[0]
     found = hand_eye.solve_hand_eye(views)
     zeros = dict(zip(views.shared_names, found.guess.shared.tolist(), strict=True))
     return evaluation.judge_fit(found.used, found.factor, zeros, 0.0087, [])
@@ -248,10 +243,8 @@ def judged(machine: Machine, joint: int, factor: float) -> evaluation.Verdict:
     [(0, 1.0, "good"), (0, 1.1, "not to be trusted"), (3, 0.95, "not to be trusted"),
      (1, -1.0, "not to be trusted"), (4, -1.0, "not to be trusted")],
 )  # fmt: skip
-def test_only_a_right_arm_is_called_good(
-    machine: Machine, joint: int, factor: float, status: str
-) -> None:
-    assert judged(machine, joint, factor).status == status
+def test_only_a_right_arm_is_called_good(joint: int, factor: float, status: str) -> None:
+    assert judged(joint, factor).status == status
 
 
 def test_a_fit_is_judged_by_what_it_leaves_out_and_what_it_lacks() -> None:

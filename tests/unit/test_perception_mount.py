@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import every, option
+from composed import MACHINE, every, option
 
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.extensions import load_part
@@ -32,15 +32,15 @@ def believe(std_m: float = 0.01) -> HoleBelief:
     return HoleBelief.expect(None, HOLE_M, 0.05, std_m)
 
 
-def plan(machine: Machine, name: str, **fields: Any) -> tuple[Any, Any]:
-    mount = option("perception/mount", name, **fields).build(machine)
-    return mount, ViewPlanner(load_part("next_view"), machine, mount, RIG, ARM)
+def plan(name: str, **fields: Any) -> tuple[Any, Any]:
+    mount = option("perception/mount", name, **fields).build(MACHINE)
+    return mount, ViewPlanner(load_part("next_view"), MACHINE, mount, RIG, ARM)
 
 
 @every("perception/mount")
-def test_a_mount_is_at_its_start_at_once_and_later_elsewhere(name: str, machine: Machine) -> None:
-    mount = option("perception/mount", name).build(machine)
-    views, q = mount.views, machine.home
+def test_a_mount_is_at_its_start_at_once_and_later_elsewhere(name: str) -> None:
+    mount = option("perception/mount", name).build(MACHINE)
+    views, q = mount.views, MACHINE.home
     travel_s = mount.compute_travel_s(mount.start, np.concatenate([mount.start[None], views]))
     assert travel_s[0] == 0.0
     is_elsewhere = (np.abs(views - mount.start) > 0).any(-1)
@@ -56,8 +56,8 @@ def test_a_mount_is_at_its_start_at_once_and_later_elsewhere(name: str, machine:
     assert mount.describe(mount.start)
 
 
-def test_lift_and_pan_move_the_camera_as_worked_out_by_hand(machine: Machine) -> None:
-    mount = option("perception/mount", "mast").build(machine)
+def test_lift_and_pan_move_the_camera_as_worked_out_by_hand() -> None:
+    mount = option("perception/mount", "mast").build(MACHINE)
     q = np.zeros(5)
     q[0] = np.pi / 2
     pose = mount.locate(np.array([1.5, np.pi / 2]), q)
@@ -79,8 +79,8 @@ def test_a_rod_hides_exactly_the_part_of_the_rim_behind_it() -> None:
     assert compute_visible_share(np.stack([camera, aside]), rim, rod)[1] == 1.0
 
 
-def test_the_next_view_sees_a_hole_that_the_arm_will_hide(machine: Machine) -> None:
-    mount, planner = plan(machine, "mast")
+def test_the_next_view_sees_a_hole_that_the_arm_will_hide() -> None:
+    mount, planner = plan("mast")
     # the arm comes to rest between the camera and the hole
     q = np.array([0.0, -0.6, 1.2, 0.8, 0.3])
     between = (mount.locate(mount.start, q)[:3, 3] + 3 * HOLE_M) / 4
@@ -117,11 +117,9 @@ def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
     assert any(solid is level.block for solid in level.solids)
 
 
-def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
-    machine: Machine,
-) -> None:
-    mount, planner = plan(machine, "mast")
-    q = np.stack([machine.home] * 7)
+def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself() -> None:
+    mount, planner = plan("mast")
+    q = np.stack([MACHINE.home] * 7)
     assert not planner.aim(believe(), q, 0.0).is_moving
     planner.num_missed = 8
     view = planner.aim(believe(), q, 3.0)
@@ -129,10 +127,10 @@ def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
     assert (planner.num_missed, planner.arrives_s) == (0, 3.0 + view.travel_s)
 
 
-def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) -> None:
+def test_the_mast_turns_to_the_hole_wherever_the_arm_points() -> None:
     for q1 in (-1.2, 0.0, 1.2):
-        mount, planner = plan(machine, "mast")
-        q = machine.home.copy()
+        mount, planner = plan("mast")
+        q = MACHINE.home.copy()
         q[0] = q1
         planner.aim(believe(), np.stack([q] * 7), 0.0)
         ahead = mount.locate(planner.position, q)[:3, 2]
@@ -142,11 +140,11 @@ def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) ->
         assert abs(np.angle(np.exp(1j * bearing))) < 0.5
 
 
-def watch(machine: Machine) -> WatchedHole:
+def watch() -> WatchedHole:
     mast = option("perception/mount", "mast")
     settings = replace(option("target", "perceived"), mount=mast, delay_s=0.35, hint_m=0.03)
     scene = np.array([*HOLE_M, 0.0, 1.0, 0.05, 0.0])
-    return WatchedHole(settings, machine, scene, (0,))
+    return WatchedHole(settings, MACHINE, scene, (0,))
 
 
 def detect(center_m: np.ndarray) -> HolePose:
@@ -154,10 +152,8 @@ def detect(center_m: np.ndarray) -> HolePose:
     return HolePose(center_m, UP, 0.05, cov, np.zeros((3, 3)), "base", 0.9, 0.0)
 
 
-def test_what_a_picture_shows_is_known_after_the_delay_and_near_the_pointed_place_alone(
-    machine: Machine,
-) -> None:
-    eye = watch(machine)
+def test_what_a_picture_shows_is_known_after_the_delay_and_near_the_pointed_place_alone() -> None:
+    eye = watch()
     assert 0.0 < np.linalg.norm(eye.center_m - HOLE_M) < 0.15
     eye.wait_for([detect(HOLE_M + np.array([0.4, 0.0, 0.0]))], 0.0)
     eye.learn(0.4)
@@ -170,8 +166,8 @@ def test_what_a_picture_shows_is_known_after_the_delay_and_near_the_pointed_plac
     assert [is_seen for is_seen, _ in eye.history] == [True, True]
 
 
-def test_a_picture_that_was_not_taken_is_no_miss(machine: Machine) -> None:
-    eye = watch(machine)
+def test_a_picture_that_was_not_taken_is_no_miss() -> None:
+    eye = watch()
     for t_s, holes in ((0.0, ()), (0.5, None), (1.0, ())):
         eye.wait_for(holes, t_s)
     eye.learn(2.0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
+from composed import MACHINE, option
 
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import (
@@ -29,8 +29,8 @@ from brokk_rl.signals import Command, JointState
 OPEN = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
 
-def measure_speed(machine: Machine, q: np.ndarray) -> np.ndarray:
-    return measure_tool_speed(machine, q, np.gradient(q, machine.period_s, axis=0))
+def measure_speed(q: np.ndarray) -> np.ndarray:
+    return measure_tool_speed(MACHINE, q, np.gradient(q, MACHINE.period_s, axis=0))
 
 
 def constant(joints: dict[int, float], seconds: float, start: np.ndarray, **fields: Any) -> Segment:
@@ -45,56 +45,53 @@ RUN_S = 120.0
 
 
 def played(
-    runs: Sequence[Sequence[Segment]],
-    machine: Machine,
-    guards: CommandGuards = OPEN,
-    link: Any = None,
+    runs: Sequence[Sequence[Segment]], guards: CommandGuards = OPEN, link: Any = None
 ) -> PlanTrack:
     plan = ExcitationPlan(runs=tuple(map(tuple, runs)), run_s=RUN_S, names=("a",))
-    link = link or NominalLink(machine, len(runs))
-    player = PlanPlayer(plan, machine, guards)
-    return PlanTrack(drive(link, player, machine, len(runs), RUN_S))
+    link = link or NominalLink(MACHINE, len(runs))
+    player = PlanPlayer(plan, MACHINE, guards)
+    return PlanTrack(drive(link, player, MACHINE, len(runs), RUN_S))
 
 
-def find_shares(machine: Machine, q: np.ndarray) -> np.ndarray:
+def find_shares(q: np.ndarray) -> np.ndarray:
     """Returns how far joints are from positions, in parts of their travel."""
-    return np.abs(q) / (machine.upper - machine.lower)
+    return np.abs(q) / (MACHINE.upper - MACHINE.lower)
 
 
-def anywhere(machine: Machine, seed: int) -> np.ndarray:
-    margin = 0.1 * (machine.upper - machine.lower)
-    return np.random.default_rng(seed).uniform(machine.lower + margin, machine.upper - margin)
+def anywhere(seed: int) -> np.ndarray:
+    margin = 0.1 * (MACHINE.upper - MACHINE.lower)
+    return np.random.default_rng(seed).uniform(MACHINE.lower + margin, MACHINE.upper - margin)
 
 
-def with_speed(machine: Machine, scale: float) -> Machine:
+def with_speed(scale: float) -> Machine:
     joints = []
-    for joint in machine.joints:
+    for joint in MACHINE.joints:
         speed = replace(joint.max_speed, value=joint.max_speed.value * scale)
         joints.append(replace(joint, max_speed=speed))
-    return replace(machine, joints=tuple(joints))
+    return replace(MACHINE, joints=tuple(joints))
 
 
-def test_a_program_is_played_unchanged_from_its_start_pose(machine: Machine) -> None:
+def test_a_program_is_played_unchanged_from_its_start_pose() -> None:
     generator = np.random.default_rng(0)
-    start = np.stack([anywhere(machine, seed) for seed in range(4)])
+    start = np.stack([anywhere(seed) for seed in range(4)])
     programs = 0.05 * generator.uniform(-1, 1, (4, 100, 5)) * (np.arange(5) != 1)
     runs = [[constant({}, 1.0, s, u=u)] for s, u in zip(start, programs, strict=True)]
-    track = played(runs, machine)
+    track = played(runs)
     for n, (segment,) in enumerate(runs):
         inside = track.phase[:, n] == PLAY
         assert (track.u[inside, n] == segment.u).all()
-        assert find_shares(machine, track.q[inside, n][0] - segment.start).max() <= 0.04
+        assert find_shares(track.q[inside, n][0] - segment.start).max() <= 0.04
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 1.5])
 def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
-    scale: float, machine: Machine, caplog: pytest.LogCaptureFixture
+    scale: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     runs = []
     for n in range(5):
-        starts = [anywhere(machine, 10 * n + i) for i in range(3)]
+        starts = [anywhere(10 * n + i) for i in range(3)]
         runs.append([constant({}, 1.0, start, name=f"a_{i}") for i, start in enumerate(starts)])
-    track = played(runs, machine, link=NominalLink(with_speed(machine, scale), 5))
+    track = played(runs, link=NominalLink(with_speed(scale), 5))
     assert not caplog.records
     assert (track.phase[-1] == PLAY).any()
     assert track.segment[-1].tolist() == [2] * 5
@@ -102,36 +99,34 @@ def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
         for i in range(3):
             is_played = track.phase[:, n] == PLAY
             begin = np.flatnonzero((track.segment[:, n] == i) & is_played)[0]
-            assert find_shares(machine, track.q[begin, n] - runs[n][i].start).max() < 0.05
+            assert find_shares(track.q[begin, n] - runs[n][i].start).max() < 0.05
 
 
-def test_exclusive_joints_never_move_together_with_others_on_the_way_either(
-    machine: Machine,
-) -> None:
+def test_exclusive_joints_never_move_together_with_others_on_the_way_either() -> None:
     # No excitation may ask for this; the runner drops q2.
-    together = constant({1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0))
-    runs = [[constant({}, 1.0, anywhere(machine, n)), together] for n in range(6)]
-    track = played(runs, machine)
+    together = constant({1: 0.5, 3: 0.5}, 2.0, anywhere(0))
+    runs = [[constant({}, 1.0, anywhere(n)), together] for n in range(6)]
+    track = played(runs)
     alone, others = track.u[:, :, 1] != 0, (np.delete(track.u, 1, axis=2) != 0).any(2)
     assert alone.any() and others.any() and not (alone & others).any()
 
 
-def test_the_stops_are_kept_although_the_command_acts_late(machine: Machine) -> None:
+def test_the_stops_are_kept_although_the_command_acts_late() -> None:
     for scale in (1.0, 1.4):
         for sign in (-1.0, 1.0):
-            segments = [constant({0: sign, 2: sign, 3: sign, 4: sign}, 30.0, machine.home)]
-            link = NominalLink(with_speed(machine, scale), 1)
-            track = played([segments], machine, link=link)
-            left = np.minimum(track.q - machine.lower, machine.upper - track.q).min((0, 1))
+            segments = [constant({0: sign, 2: sign, 3: sign, 4: sign}, 30.0, MACHINE.home)]
+            link = NominalLink(with_speed(scale), 1)
+            track = played([segments], link=link)
+            left = np.minimum(track.q - MACHINE.lower, MACHINE.upper - track.q).min((0, 1))
             assert left.min() > 0.0, f"speed x {scale}: {left}"
-            assert np.delete(find_shares(machine, left), 1).max() < 0.06, "and they are reached"
+            assert np.delete(find_shares(left), 1).max() < 0.06, "and they are reached"
 
 
-def test_inward_turns_a_joint_back_until_its_program_passes_zero(machine: Machine) -> None:
+def test_inward_turns_a_joint_back_until_its_program_passes_zero() -> None:
     u = np.zeros((500, 5))
     u[:, 4] = 0.8
     u[400:, 4] = -0.8
-    track = played([[constant({}, 0.0, machine.home, u=u)]], machine)
+    track = played([[constant({}, 0.0, MACHINE.home, u=u)]])
     inside = track.phase[:, 0] == PLAY
     sent = track.u[inside, 0, 4]
     assert set(np.abs(sent)) == {0.8}
@@ -139,43 +134,43 @@ def test_inward_turns_a_joint_back_until_its_program_passes_zero(machine: Machin
     assert (sent[400:420] == -0.8).all()
 
 
-def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(machine: Machine) -> None:
+def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero() -> None:
     u = np.zeros((2000, 5))
     # Drives into the stop, then slowly back.
     u[:, 2] = np.where(np.arange(2000) // 500 % 2 == 0, 0.9, -0.2)
-    track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine)
+    track = played([[constant({}, 0.0, MACHINE.home, u=u, stops="home")]])
     phase = track.phase[:, 0]
     begin = np.flatnonzero(phase >= PLAY)[0]
     away = np.flatnonzero(phase > PLAY) - begin
     assert 100 < away[0] < 200, "1.4 rad from home to the margin at 0.9 * 0.26 rad/s"
     back = away[np.flatnonzero(np.diff(away) > 1)[0]] + 1
     assert back == 500 and track.u[begin + 500, 0, 2] == -0.2
-    assert abs(track.q[begin + 499, 0, 2] - machine.home[2]) < 0.1
+    assert abs(track.q[begin + 499, 0, 2] - MACHINE.home[2]) < 0.1
     assert (phase >= PLAY).sum() == 2000, "a segment lasts as long as its program"
 
 
-def test_commands_keep_to_the_largest(machine: Machine) -> None:
+def test_commands_keep_to_the_largest() -> None:
     guards = CommandGuards(max_command=0.3, max_tool_speed_m_s=None)
-    segment = constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))
-    track = played([[segment]], machine, guards)
+    segment = constant({0: 1.0, 3: -1.0}, 3.0, anywhere(1))
+    track = played([[segment]], guards)
     assert np.abs(track.u).max() == 0.3
 
 
-def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(machine: Machine) -> None:
-    segment = constant({0: 1.0, 3: 0.5}, 4.0, machine.home)
+def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept() -> None:
+    segment = constant({0: 1.0, 3: 0.5}, 4.0, MACHINE.home)
     guards = replace(OPEN, max_tool_speed_m_s=0.4)
-    free, slow = (played([[segment]], machine, one) for one in (OPEN, guards))
-    fast, guarded = (measure_speed(machine, track.q[:, 0]) for track in (free, slow))
+    free, slow = (played([[segment]], one) for one in (OPEN, guards))
+    fast, guarded = (measure_speed(track.q[:, 0]) for track in (free, slow))
     assert fast.max() > 0.8 and 0.35 < guarded.max() < 0.42
     u = slow.u[(slow.phase[:, 0] == PLAY), 0]
     assert u[:, 3] == pytest.approx(0.5 * u[:, 0]) and u[:, 0].max() < 1.0
 
 
-def test_the_tool_speed_is_that_of_the_kinematics(machine: Machine) -> None:
+def test_the_tool_speed_is_that_of_the_kinematics() -> None:
     # 0.1 rad/s about the vertical.
-    q = machine.home + np.linspace(0, 0.2, 41)[:, None] * np.array([1.0, 0, 0, 0, 0])
-    radius_m = np.hypot(*compute_tool_kinematics(machine, machine.home).tip_in_base_m[:2])
-    assert measure_speed(machine, q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
+    q = MACHINE.home + np.linspace(0, 0.2, 41)[:, None] * np.array([1.0, 0, 0, 0, 0])
+    radius_m = np.hypot(*compute_tool_kinematics(MACHINE, MACHINE.home).tip_in_base_m[:2])
+    assert measure_speed(q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
 
 
 class Stuck(NominalLink):
@@ -189,10 +184,10 @@ class Stuck(NominalLink):
 
 
 def test_an_approach_that_does_not_arrive_is_given_up_and_said(
-    machine: Machine, caplog: pytest.LogCaptureFixture
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    start = machine.home + 0.8 * (np.arange(machine.num_joints) == 3)
-    track = played([[constant({0: 0.3}, 1.0, start)]], machine, link=Stuck(machine, 1))
+    start = MACHINE.home + 0.8 * (np.arange(MACHINE.num_joints) == 3)
+    track = played([[constant({0: 0.3}, 1.0, start)]], link=Stuck(MACHINE, 1))
     assert (track.u[track.phase[:, 0] == PLAY, 0, 0] == 0.3).all()
     assert "start of a_00 given up, out of place: q4" in caplog.text
 
@@ -216,21 +211,21 @@ class Broken(NominalLink):
     ("link", "message"), [(Silent, "no state after"), (Broken, "finite positions")]
 )
 def test_a_link_that_fails_is_an_error(
-    link: type[NominalLink], message: str, machine: Machine, monkeypatch: Any
+    link: type[NominalLink], message: str, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr("actuators.excite.player.SILENCE_S", 0.05)
     with pytest.raises(LinkError, match=message):
-        played([[constant({0: 0.3}, 5.0, machine.home)]], machine, link=link(machine, 1))
+        played([[constant({0: 0.3}, 5.0, MACHINE.home)]], link=link(MACHINE, 1))
 
 
-def test_a_plan_fills_its_time_and_repeats_with_its_seed(machine: Machine) -> None:
+def test_a_plan_fills_its_time_and_repeats_with_its_seed() -> None:
     chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds")}
     plan, again, other = (
-        plan_runs(chosen, machine, 2, 600.0, np.random.default_rng(seed)) for seed in (1, 1, 2)
+        plan_runs(chosen, MACHINE, 2, 600.0, np.random.default_rng(seed)) for seed in (1, 1, 2)
     )
-    link = NominalLink(machine, 2)
-    runner = PlanPlayer(plan, machine, OPEN)
-    track = PlanTrack(drive(link, runner, machine, 2, 600.0))
+    link = NominalLink(MACHINE, 2)
+    runner = PlanPlayer(plan, MACHINE, OPEN)
+    track = PlanTrack(drive(link, runner, MACHINE, 2, 600.0))
     assert runner.done and len(track.t_s) > 0.75 * 600 * 20, "neither cut nor left empty"
     for run, same in zip(plan.runs, again.runs, strict=True):
         for a, b in zip(run, same, strict=True):

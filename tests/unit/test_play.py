@@ -23,7 +23,7 @@ def made() -> Callable[..., PlaySession]:
     """Makes sessions of two quiet machines, on which the classical controller drives."""
     task = option("task", "borehole_insertion")
     task = replace(task, noise=replace(task.noise, filter="mean"))
-    plant = runs.plant(option("machine", "brokk170"), task, option("sim", "native"))
+    plant = runs.plant(task, option("sim", "native"))
     library = {"library": option("effect", "library")}
     config = replace(plant, actuator=option("actuator", "ideal"), effect=library)
 

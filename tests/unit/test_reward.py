@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 
 from brokk_rl import observation
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.machine import mask_exclusive_joints
 from brokk_rl.observation import ObservationEncoder, TargetScaling, list_pose_parts
 from tasks import terms
 from tasks.settings import ActionMapping, CommandBase, PhaseSwitch
@@ -182,30 +182,30 @@ SCALING = TargetScaling(**PLACE, pitch_rad=None)
 WITH_PITCH = TargetScaling(**PLACE, pitch_rad=(1.4, 0.35))
 
 
-def make_values(machine: Machine, count: int = 4) -> dict[str, np.ndarray]:
+def make_values(count: int = 4) -> dict[str, np.ndarray]:
     generator = np.random.default_rng(0)
-    shape = (count, machine.num_history, machine.num_joints)
+    shape = (count, MACHINE.num_history, MACHINE.num_joints)
     values = {
         "target_in_base_m": generator.uniform((2, -1, 0.6), (3, 1, 0.9), (count, 3)),
-        "q": generator.uniform(machine.lower, machine.upper, shape),
+        "q": generator.uniform(MACHINE.lower, MACHINE.upper, shape),
         "u": generator.uniform(-1, 1, shape),
         "pitch_rad": generator.uniform(0.6, 2, count),
     }
     return {name: value.astype(np.float32) for name, value in values.items()}
 
 
-def make_encoder(machine: Machine, scaling: TargetScaling) -> ObservationEncoder:
-    return ObservationEncoder(list_pose_parts(machine, scaling))
+def make_encoder(scaling: TargetScaling) -> ObservationEncoder:
+    return ObservationEncoder(list_pose_parts(MACHINE, scaling))
 
 
-def test_target_then_positions_then_commands_each_oldest_first(machine: Machine) -> None:
+def test_target_then_positions_then_commands_each_oldest_first() -> None:
     q, u = np.zeros((1, 13, 5), np.float32), np.zeros((1, 13, 5), np.float32)
     # oldest sample of q2: travel -1.4 to 0.05, middle -0.675, quarter 0.3625, so
     # (0.05 + 0.675) / 0.3625 = 2; newest sample of q5, at its upper limit: 2 as well
     q[0, 0, 1], q[0, 12, 4] = 0.05, 2.2
     u[0, 0, 1], u[0, 12, 4] = 0.25, -0.5
     target_m = np.array([[3.0, -1.0, 0.85]], np.float32)
-    encoder = make_encoder(machine, SCALING)
+    encoder = make_encoder(SCALING)
     vector = encoder.encode({"target_in_base_m": target_m, "q": q, "u": u})[0]
     assert vector.shape == (133,) and encoder.size == 3 + 13 * 5 + 13 * 5 == 133
     assert vector[:3] == pytest.approx([1.0, -1.0, 1.0], abs=1e-5)
@@ -214,34 +214,30 @@ def test_target_then_positions_then_commands_each_oldest_first(machine: Machine)
 
 
 @pytest.mark.parametrize("scaling", [SCALING, WITH_PITCH], ids=["paper", "with pitch"])
-def test_numpy_and_torch_say_the_same_and_decoding_inverts_it(
-    machine: Machine, scaling: TargetScaling
-) -> None:
-    values, encoder = make_values(machine), make_encoder(machine, scaling)
+def test_numpy_and_torch_say_the_same_and_decoding_inverts_it(scaling: TargetScaling) -> None:
+    values, encoder = make_values(), make_encoder(scaling)
     vector = encoder.encode(values)
     for name, found in encoder.decode(vector).items():
         np.testing.assert_allclose(found, values[name], atol=1e-6)
-    in_torch = ObservationEncoder(list_pose_parts(machine, scaling), torch.as_tensor, torch.cat)
+    in_torch = ObservationEncoder(list_pose_parts(MACHINE, scaling), torch.as_tensor, torch.cat)
     by_torch = in_torch.encode({name: torch.as_tensor(value) for name, value in values.items()})
     assert vector.dtype == np.float32 and by_torch.dtype == torch.float32
     np.testing.assert_allclose(vector, by_torch.numpy(), rtol=0, atol=1e-6)
 
 
-def test_the_contract_tells_size_order_and_scale_and_gives_the_encoder_back(
-    machine: Machine,
-) -> None:
-    paper, pitch = (make_encoder(machine, one).describe() for one in (SCALING, WITH_PITCH))
+def test_the_contract_tells_size_order_and_scale_and_gives_the_encoder_back() -> None:
+    paper, pitch = (make_encoder(one).describe() for one in (SCALING, WITH_PITCH))
     assert paper["size"] == 133 and len(paper["order"]) == 3 and "pitch" not in paper
     assert pitch["size"] == 134 and pitch["order"][3] == "pitch_rad (1)"
     assert pitch["pitch"] == {"mean_rad": 1.4, "std_rad": 0.35}
     assert paper["q"]["mean"][1] == pytest.approx(-0.675)
     assert paper["q"]["std"][1] == pytest.approx(0.3625)
-    assert observation.restore_encoder(machine, pitch).describe() == pitch
+    assert observation.restore_encoder(MACHINE, pitch).describe() == pitch
 
 
-def test_ranges_are_those_of_the_values_in_their_units(machine: Machine) -> None:
-    values, encoder = make_values(machine), make_encoder(machine, SCALING)
-    found = observation.measure_ranges(encoder, encoder.encode(values), machine.joint_names)
+def test_ranges_are_those_of_the_values_in_their_units() -> None:
+    values, encoder = make_values(), make_encoder(SCALING)
+    found = observation.measure_ranges(encoder, encoder.encode(values), MACHINE.joint_names)
     q1, x, y = values["q"][:, :, 0], *values["target_in_base_m"][:, :2].T
     assert found["q.q1"] == pytest.approx((q1.min(), q1.max()), abs=1e-6)
     assert found["target.x"] == pytest.approx((x.min(), x.max()), abs=1e-6)
@@ -314,21 +310,21 @@ def test_commands_stay_before_ends_and_within_a_step(
 
 
 @pytest.mark.parametrize("kind", ["direct", "residual"])
-def test_the_masks_are_the_papers_and_those_of_the_machine(kind: str, machine: Machine) -> None:
+def test_the_masks_are_the_papers_and_those_of_the_machine(kind: str) -> None:
     action = ActionMapping(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
         base = CommandBase(torch.full((1, 5), 0.3), -FREE, FREE, flag)
-        u = action.command(5 * torch.ones(1, 5), base, torch.as_tensor(machine.is_exclusive))
-        machines = mask_exclusive_joints(machine.is_exclusive, positioning)
+        u = action.command(5 * torch.ones(1, 5), base, torch.as_tensor(MACHINE.is_exclusive))
+        machines = mask_exclusive_joints(MACHINE.is_exclusive, positioning)
         assert u[0].tolist() == paper == machines.astype(int).tolist()
 
 
-def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
+def test_direct_and_residual_actions_on_numbers() -> None:
     output = torch.tensor([[0.4, 0.4, -0.4, 4.0, 0.0]])
     command = torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]])
     base = CommandBase(command, -FREE, FREE, torch.tensor([False]))
-    exclusive = torch.as_tensor(machine.is_exclusive)
+    exclusive = torch.as_tensor(MACHINE.is_exclusive)
     residual = ActionMapping(kind="residual", scale=0.5, mask=True, limits=False)
     direct = replace(residual, kind="direct").command(output, base, exclusive)
     unmasked = replace(residual, mask=False).command(output, base, exclusive)

@@ -16,11 +16,10 @@ import onnxruntime
 import pytest
 import torch
 import training as runs
-from composed import option
+from composed import MACHINE, option
 from safetensors.torch import load_file, save_file
 
 from brokk_rl.errors import CheckpointError, ConfigError
-from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder, list_pose_parts
 from brokk_rl.policy_folder import TOLERANCE, describe_policy, find_policy, write_policy
 from brokk_rl.rl import export
@@ -41,26 +40,26 @@ class Bundle:
     contract: dict[str, Any]
 
 
-def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundle:
+def export_policy(folder: Path, name: str, kind: str) -> Bundle:
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     task = option("task", name)
     silent, action = replace(task.noise, **runs.SILENT), replace(task.action, kind=kind)
     task = replace(task, noise=silent, action=action)
-    loop = runs.plant(machine, task).build(CPU, 16, 64, 3)
+    loop = runs.plant(task).build(CPU, 16, 64, 3)
     network = TRAINING.describe_network()
     actor = make_actor(network, loop.get_observations(), loop.num_actions)
     with torch.no_grad():
         for parameter in actor.mlp.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.1)
-    contract = describe_policy(network, loop.task, loop.description, machine, actuator=None)
+    contract = describe_policy(network, loop.task, loop.description, MACHINE, actuator=None)
     write_policy(folder, contract, actor.state_dict())
     seen = []
     for _ in range(25):
         seen.append(loop.record_answers(actor, 16))
         loop.step(torch.randn(16, 5))
     answers = torch.cat([one[0] for one in seen]), torch.cat([one[1] for one in seen])
-    export.export_onnx(folder, actor, task.build(machine, 1, CPU), machine, contract, answers)
+    export.export_onnx(folder, actor, task.build(MACHINE, 1, CPU), MACHINE, contract, answers)
     return Bundle(folder, loop, actor, json.loads((folder / "policy.json").read_text()))
 
 
@@ -70,9 +69,9 @@ def open_network(bundle: Bundle) -> onnxruntime.InferenceSession:
 
 
 @pytest.fixture(scope="module")
-def bundle(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     folder = tmp_path_factory.mktemp("policy")
-    return export_policy(machine, folder, "borehole_insertion", "residual")
+    return export_policy(folder, "borehole_insertion", "residual")
 
 
 @pytest.fixture
@@ -82,11 +81,11 @@ def copied(bundle: Bundle, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: Machine) -> None:
+def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle) -> None:
     contract = bundle.contract
     assert contract["schema"] == 2 and contract["machine"] == "brokk170"
-    assert contract["fingerprint"] == machine.fingerprint() and contract["rate_hz"] == 20.0
-    assert contract["joints"] == contract["command"]["order"] == list(machine.joint_names)
+    assert contract["fingerprint"] == MACHINE.fingerprint() and contract["rate_hz"] == 20.0
+    assert contract["joints"] == contract["command"]["order"] == list(MACHINE.joint_names)
     assert contract["exclusive"] == ["q2"] and contract["observation"]["size"] == 133
     assert contract["observation"]["switch"]["rule"] == "planar"
     parity = contract["parity"]
@@ -94,11 +93,11 @@ def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: M
     assert parity["largest_difference"] < TOLERANCE
 
 
-def test_the_onnx_file_carries_the_contract(bundle: Bundle, machine: Machine) -> None:
+def test_the_onnx_file_carries_the_contract(bundle: Bundle) -> None:
     session = open_network(bundle)
     told = session.get_modelmeta().custom_metadata_map
     assert told["brokk.machine"] == "brokk170" and float(told["brokk.rate_hz"]) == 20.0
-    assert json.loads(told["brokk.fingerprint"]) == machine.fingerprint()
+    assert json.loads(told["brokk.fingerprint"]) == MACHINE.fingerprint()
     assert json.loads(told["brokk.observation"]) == bundle.contract["observation"]
     (given,), (taken,) = session.get_inputs(), session.get_outputs()
     assert (given.name, given.shape) == ("observation", ["batch", 133]) and taken.name == "command"
@@ -107,12 +106,12 @@ def test_the_onnx_file_carries_the_contract(bundle: Bundle, machine: Machine) ->
 @pytest.mark.parametrize("kind", ["residual", "direct"])
 @pytest.mark.parametrize("name", ["borehole_insertion", "goal_pose"])
 def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
-    name: str, kind: str, machine: Machine, tmp_path: Path
+    name: str, kind: str, tmp_path: Path
 ) -> None:
     """Numpy's encoder and onnxruntime on the recorded history against the control loop's own way from observation to command."""
-    made = export_policy(machine, tmp_path / "policy", name, kind)
+    made = export_policy(tmp_path / "policy", name, kind)
     session = open_network(made)
-    encoder = ObservationEncoder(list_pose_parts(machine, option("task", name).scaling))
+    encoder = ObservationEncoder(list_pose_parts(MACHINE, option("task", name).scaling))
     loop, policy = made.loop, NetworkPolicy(made.actor, made.loop)
     loop.begin()
     off = []
@@ -191,8 +190,8 @@ def test_the_newest_of_weights_and_checkpoints_is_the_policy(copied: Path) -> No
     assert find_policy(str(copied)).file.name == "model_3.pt"
 
 
-def test_a_policy_of_another_task_is_refused(copied: Path, machine: Machine) -> None:
-    loop = runs.plant(machine, option("task", "goal_pose")).build(CPU, 2, 4, 0)
+def test_a_policy_of_another_task_is_refused(copied: Path) -> None:
+    loop = runs.plant(option("task", "goal_pose")).build(CPU, 2, 4, 0)
     with pytest.raises(CheckpointError, match=r"trained for task=borehole_insertion, not for task"):
         TrainedPolicy(path=str(copied), task=None).build(loop, 0)
 
@@ -205,7 +204,7 @@ def test_an_observation_group_that_the_task_does_not_give_is_refused(bundle: Bun
 
 
 def test_a_file_that_says_something_else_is_not_left_behind(
-    bundle: Bundle, copied: Path, machine: Machine, monkeypatch: pytest.MonkeyPatch
+    bundle: Bundle, copied: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("policy.onnx", "golden.json"):
         (copied / name).unlink()
@@ -215,10 +214,10 @@ def test_a_file_that_says_something_else_is_not_left_behind(
 
     wrong = SimpleNamespace(run=answer)
     monkeypatch.setattr(export.onnxruntime, "InferenceSession", lambda *_, **__: wrong)
-    task = option("task", "borehole_insertion").build(machine, 1, CPU)
+    task = option("task", "borehole_insertion").build(MACHINE, 1, CPU)
     answers = bundle.loop.record_answers(bundle.actor, 16)
     with pytest.raises(CheckpointError, match=r"differs from the answers .* custom layer"):
-        export.export_onnx(copied, bundle.actor, task, machine, bundle.contract, answers)
+        export.export_onnx(copied, bundle.actor, task, MACHINE, bundle.contract, answers)
     assert sorted(path.name for path in copied.iterdir()) == ["policy.json", "policy.safetensors"]
 
 

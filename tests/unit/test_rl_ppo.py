@@ -19,7 +19,6 @@ from tensordict import TensorDict
 from training import make, small, train
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.rollout import CapturedRollout
 from brokk_rl.rl.settings import CAPPED, Exploration, Teacher, TrainingConfig
@@ -235,13 +234,13 @@ def test_the_noise_lies_between_bound_and_cap(std: float, cap: float, expected: 
     assert noise.std[0].tolist() == pytest.approx([expected] * 2)
 
 
-def test_training_moves_the_cap_and_a_checkpoint_keeps_it(machine: Machine, tmp_path: Path) -> None:
+def test_training_moves_the_cap_and_a_checkpoint_keeps_it(tmp_path: Path) -> None:
     training = capped(small(max_env_steps=16 * 4 * 40, save_interval=10))
-    runner = train(machine, tmp_path, training)
+    runner = train(tmp_path, training)
     cap = runner.alg.actor.distribution.log_cap
     # moved at the start of every tenth iteration, the last time when 30 of 40 were done
     assert cap.item() == pytest.approx(math.log(0.125))
-    again = make(machine, tmp_path / "again", training)
+    again = make(tmp_path / "again", training)
     assert again.alg.actor.distribution.log_cap.item() == pytest.approx(math.log(0.5))
     again.load(str(tmp_path / "model_40.pt"))
     assert again.alg.actor.distribution.log_cap.item() == pytest.approx(math.log(0.125))

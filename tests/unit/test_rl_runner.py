@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import training as runs
-from composed import option
+from composed import MACHINE, option
 from rsl_rl.models import RNNModel
 
 from brokk_rl.errors import (
@@ -23,7 +23,6 @@ from brokk_rl.errors import (
     StorageError,
     TrainingError,
 )
-from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import (
     describe_policy,
     find_checkpoint,
@@ -38,10 +37,8 @@ ITERATION = 16 * runs.STEPS
 """Control steps of one iteration."""
 
 
-def test_the_budget_of_steps_ends_training_with_a_whole_iteration(
-    machine: Machine, tmp_path: Path
-) -> None:
-    runner = runs.train(machine, tmp_path, runs.small(max_env_steps=4 * ITERATION + 1))
+def test_the_budget_of_steps_ends_training_with_a_whole_iteration(tmp_path: Path) -> None:
+    runner = runs.train(tmp_path, runs.small(max_env_steps=4 * ITERATION + 1))
     rows = runs.progress(tmp_path)
     assert [int(float(row["env_steps"])) for row in rows] == [ITERATION * (i + 1) for i in range(5)]
     assert [int(row["iteration"]) for row in rows] == list(range(5))
@@ -53,17 +50,17 @@ class Remembering(RNNModel):
 
 
 def test_a_network_with_a_memory_is_refused_before_the_first_step_whatever_its_name(
-    machine: Machine, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     training = runs.small(max_env_steps=ITERATION)
     actor = training.runner["actor"] | {"class_name": f"{__name__}:Remembering"}
     training = replace(training, runner=training.runner | {"actor": actor})
     with pytest.raises(ConfigError, match="a network with memory"):
-        runs.make(machine, tmp_path, training)
+        runs.make(tmp_path, training)
 
 
-def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -> None:
-    runner = runs.make(machine, tmp_path, runs.small(max_seconds=0.4, save_interval=1000))
+def test_the_budget_of_seconds_ends_training(tmp_path: Path) -> None:
+    runner = runs.make(tmp_path, runs.small(max_seconds=0.4, save_interval=1000))
     runner.run()
     assert 0.4 <= runner.logger.seconds < 2.0
 
@@ -80,11 +77,9 @@ def test_training_without_an_end_is_refused() -> None:
         TrainingBudget(max_env_steps=None, max_seconds=None)
 
 
-def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(tmp_path: Path) -> None:
     often = {"save_interval": 2, "keep_checkpoints": 2}
-    runs.train(machine, tmp_path, runs.small(max_env_steps=7 * ITERATION, **often))
+    runs.train(tmp_path, runs.small(max_env_steps=7 * ITERATION, **often))
     assert [path.name for path in list_checkpoints(tmp_path)] == ["model_6.pt", "model_7.pt"]
     assert not list(tmp_path.glob("*.part"))
 
@@ -98,9 +93,9 @@ def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None
 
 
 def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
-    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runner = runs.train(machine, tmp_path, runs.small(max_env_steps=ITERATION))
+    runner = runs.train(tmp_path, runs.small(max_env_steps=ITERATION))
     before = (tmp_path / "model_1.pt").read_bytes()
 
     def fill_disk(path: Path, data: bytes) -> None:
@@ -118,36 +113,36 @@ def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
 
 
 @pytest.fixture
-def checkpoint(machine: Machine, tmp_path: Path) -> Path:
-    runs.train(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
+def checkpoint(tmp_path: Path) -> Path:
+    runs.train(tmp_path / "run", runs.small(max_env_steps=ITERATION))
     return tmp_path / "run" / "model_1.pt"
 
 
-def loading(machine: Machine, checkpoint: Path, **changes: Any) -> None:
-    runner = runs.make(machine, checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes))
+def loading(checkpoint: Path, **changes: Any) -> None:
+    runner = runs.make(checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes))
     runner.load(str(checkpoint))
 
 
 def test_bytes_that_are_no_checkpoint_are_named_corrupt_and_change_nothing(
-    checkpoint: Path, machine: Machine
+    checkpoint: Path,
 ) -> None:
     progress = checkpoint.with_name("progress.csv")
     before = progress.read_text()
     for content in (checkpoint.read_bytes()[:2000], b"", b"hello", b"\x80\x04]q\x00."):
         checkpoint.write_bytes(content)
         with pytest.raises(CheckpointError, match=r"model_1\.pt is missing or corrupt"):
-            loading(machine, checkpoint)
+            loading(checkpoint)
     assert progress.read_text() == before
 
 
-def test_a_checkpoint_cannot_run_code(checkpoint: Path, machine: Machine) -> None:
+def test_a_checkpoint_cannot_run_code(checkpoint: Path) -> None:
     class Trap:
         def __reduce__(self) -> tuple[Any, ...]:
             return (Path.touch, (checkpoint.with_name("trapped"),))
 
     torch.save({"actor_state_dict": Trap()}, checkpoint)
     with pytest.raises(CheckpointError, match="corrupt: no checkpoint of ours"):
-        loading(machine, checkpoint)
+        loading(checkpoint)
     assert not checkpoint.with_name("trapped").exists()
 
 
@@ -162,35 +157,35 @@ def test_a_checkpoint_cannot_run_code(checkpoint: Path, machine: Machine) -> Non
     ],
 )  # fmt: skip
 def test_a_checkpoint_with_a_part_spoiled_or_missing_is_refused(
-    change: Callable[[dict[str, Any]], Any], told: str, checkpoint: Path, machine: Machine
+    change: Callable[[dict[str, Any]], Any], told: str, checkpoint: Path
 ) -> None:
     content = torch.load(checkpoint, weights_only=True)
     change(content)
     torch.save(content, checkpoint)
     with pytest.raises(CheckpointError, match=told):
-        loading(machine, checkpoint)
+        loading(checkpoint)
 
 
 def test_a_checkpoint_of_another_network_or_number_of_environments_is_refused(
-    checkpoint: Path, machine: Machine
+    checkpoint: Path,
 ) -> None:
     wider = runs.small(max_env_steps=1).runner
     wider["actor"]["hidden_dims"] = [32]
     for changes in ({"runner": wider}, {"num_envs": 8}):
         with pytest.raises(CheckpointError, match="does not fit this configuration"):
-            loading(machine, checkpoint, **changes)
+            loading(checkpoint, **changes)
 
 
-def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: Machine) -> None:
+def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="holds no policy"):
         find_checkpoint(str(tmp_path))
     with pytest.raises(CheckpointError, match="there is no such path"):
         find_checkpoint(str(tmp_path / "model_3.pt"))
 
 
-def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:
+def test_too_many_faults_stop_the_run_with_an_error(tmp_path: Path) -> None:
     training = runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001)
-    runner = runs.make(machine, tmp_path, training)
+    runner = runs.make(tmp_path, training)
     step = runner.env.world.step
 
     def diverges(increment: torch.Tensor) -> None:
@@ -207,9 +202,9 @@ def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: 
 
 @pytest.mark.parametrize("number", [float("nan"), 1e30])
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
-    number: float, machine: Machine, tmp_path: Path
+    number: float, tmp_path: Path
 ) -> None:
-    runner = runs.make(machine, tmp_path, runs.small(max_env_steps=3 * ITERATION))
+    runner = runs.make(tmp_path, runs.small(max_env_steps=3 * ITERATION))
     step, calls = runner.env.step, [0]
 
     def spoils(actions: torch.Tensor) -> Any:
@@ -227,9 +222,9 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
 
 @pytest.mark.parametrize("part", ["actor", "critic"])
 def test_a_weight_that_the_last_update_spoils_is_named_and_not_written(
-    part: str, machine: Machine, tmp_path: Path
+    part: str, tmp_path: Path
 ) -> None:
-    runner = runs.make(machine, tmp_path, runs.small(max_env_steps=ITERATION))
+    runner = runs.make(tmp_path, runs.small(max_env_steps=ITERATION))
     finish = runner.alg.critic.update_normalization
 
     def spoils(observations: Any) -> None:
@@ -256,20 +251,20 @@ def spread(actor: Any) -> torch.Tensor:
 
 
 def test_training_that_begins_with_a_policy_has_its_network_and_its_own_exploration(
-    machine: Machine, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     training = runs.small(max_env_steps=64)
-    runner = runs.train(machine, tmp_path / "old", training)
+    runner = runs.train(tmp_path / "old", training)
     old = runner.alg.actor
     with torch.no_grad():
         spread(old).fill_(-3.0)  # as one that has settled
     env = runner.env
     network = training.describe_network()
-    contract = describe_policy(network, env.task, env.description, machine)
+    contract = describe_policy(network, env.task, env.description, MACHINE)
     write_policy(tmp_path / "old", contract, old.state_dict())
-    loop = runs.plant(machine).build(runs.CPU, 16, 64, 0)
+    loop = runs.plant().build(runs.CPU, 16, 64, 0)
     actor = make_actor(network, loop.get_observations(), loop.num_actions)
-    load_initial_weights(actor, str(tmp_path / "old"), machine)
+    load_initial_weights(actor, str(tmp_path / "old"), MACHINE)
     groups = loop.get_observations()
     np.testing.assert_array_equal(actor(groups).detach(), old(groups).detach())
     shipped = option("rl", "ppo").runner["actor"]["distribution_cfg"]["init_std"]
@@ -278,4 +273,4 @@ def test_training_that_begins_with_a_policy_has_its_network_and_its_own_explorat
     network["actor"]["hidden_dims"] = [8]
     other = make_actor(network, loop.get_observations(), loop.num_actions)
     with pytest.raises(CheckpointError, match="policy="):
-        load_initial_weights(other, str(tmp_path / "old"), machine)
+        load_initial_weights(other, str(tmp_path / "old"), MACHINE)

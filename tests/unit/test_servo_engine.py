@@ -27,29 +27,27 @@ SUBSTEPS = 10
 """Steps of the plant in a control period."""
 
 
-def record_arm(
-    arm: Machine, seed: int, lost: float, late_s: float, damping: float = ARM_DAMPING
-) -> Recording:
+def record_arm(seed: int, lost: float, late_s: float, damping: float = ARM_DAMPING) -> Recording:
     """Returns a minute and a half of ramps to and fro, followed by a loop of second order.
 
     A frame is lost with the chance `lost`, else late by up to `late_s`; none overtakes another.
     """
     random = np.random.default_rng(seed)
     count = 4500
-    slopes = random.uniform(0.3, 1.2, (count // 45, 5)) * arm.period_s
+    slopes = random.uniform(0.3, 1.2, (count // 45, 5)) * ARM.period_s
     slopes[1::2] *= -1.0
     u = np.cumsum(np.repeat(slopes, 45, 0), 0)
     u = np.clip(u - u.mean(0), -0.9, 0.9)
-    come_s = arm.period_s * np.arange(count) + random.uniform(0.0, 1.0, count) * late_s
+    come_s = ARM.period_s * np.arange(count) + random.uniform(0.0, 1.0, count) * late_s
     arrives = random.random(count) >= lost
     come_s = np.maximum.accumulate(come_s[arrives])
-    fine_s = arm.period_s / SUBSTEPS * np.arange(count * SUBSTEPS)
+    fine_s = ARM.period_s / SUBSTEPS * np.arange(count * SUBSTEPS)
     sent = u[arrives][np.maximum(np.searchsorted(come_s, fine_s, "right") - 1, 0)]
-    middle, half = (arm.upper + arm.lower) / 2, (arm.upper - arm.lower) / 2
+    middle, half = (ARM.upper + ARM.lower) / 2, (ARM.upper - ARM.lower) / 2
     loop = np.array([[0.0, 1.0], [-(ARM_RESPONSE_S**-2), -2.0 * damping / ARM_RESPONSE_S]])
     drive = np.array([[0.0], [ARM_RESPONSE_S**-2]])
     continuous = (loop, drive, np.eye(2), 0.0 * drive)
-    discrete: Any = cont2discrete(continuous, arm.period_s / SUBSTEPS)
+    discrete: Any = cont2discrete(continuous, ARM.period_s / SUBSTEPS)
     a, b = discrete[:2]
     state, q = np.stack([middle + half * u[0], np.zeros(5)]), []
     for k, command in enumerate(sent):
@@ -57,26 +55,26 @@ def record_arm(
             q.append(state[0].copy())
         state = a @ state + b * (middle + half * command)
     noise = 3e-4 * random.standard_normal((count, 5))
-    return make_recording(arm, u, np.array(q) + noise)
+    return make_recording(ARM, u, np.array(q) + noise)
 
 
-@pytest.fixture(scope="module")
-def pair() -> Machine:
-    """Two servos of a tabletop arm."""
-    arm = option("machine", "so101")
-    return replace(arm, joints=arm.joints[:2], name="pair")
+ARM = option("machine", "so101")
 
 
-def cut_joints(recording: Recording, machine: Machine) -> Recording:
+PAIR = replace(ARM, joints=ARM.joints[:2], name="pair")
+"""Two servos of a tabletop arm."""
+
+
+def cut_joints(recording: Recording) -> Recording:
     """Return a recording of the first joints only."""
-    count = machine.num_joints
-    return make_recording(machine, recording.u[:, :count], recording.q[:, :count])
+    count = PAIR.num_joints
+    return make_recording(PAIR, recording.u[:, :count], recording.q[:, :count])
 
 
-def record_pair(pair: Machine, seeds: tuple[int, ...], **changes: float) -> list[Recording]:
+def record_pair(seeds: tuple[int, ...], **changes: float) -> list[Recording]:
     """Return recordings of the first joints of the arm, sound ones without changes."""
-    arm, sound = option("machine", "so101"), {"lost": 0.0, "late_s": 0.0}
-    return [cut_joints(record_arm(arm, seed, **(sound | changes)), pair) for seed in seeds]
+    sound = {"lost": 0.0, "late_s": 0.0}
+    return [cut_joints(record_arm(seed, **(sound | changes))) for seed in seeds]
 
 
 def stand_still(machine: Machine, u: np.ndarray) -> Side:
@@ -86,40 +84,38 @@ def stand_still(machine: Machine, u: np.ndarray) -> Side:
     return stack_side([still], machine)
 
 
-def simulate(machine: Machine, u: np.ndarray, **values: float) -> np.ndarray:
+def simulate(u: np.ndarray, **values: float) -> np.ndarray:
     """Return the path of the first joint under targets `(T,)`, half travels from the middle."""
     numbers = np.zeros(len(SERVO.numbers))
     plain = {"response_s": RESPONSE_S, "damping_ratio": DAMPING, "firmware_damping": 0.5}
     for name, value in (plain | values).items():
         numbers[SERVO.place[name]] = value
-    side = stand_still(machine, np.stack([u, np.zeros_like(u)], 1))
-    middle = 0.5 * (machine.upper + machine.lower)
-    unit = 0.5 * (machine.upper - machine.lower)[0]
+    side = stand_still(PAIR, np.stack([u, np.zeros_like(u)], 1))
+    middle = 0.5 * (PAIR.upper + PAIR.lower)
+    unit = 0.5 * (PAIR.upper - PAIR.lower)[0]
     return side.simulate(0, numbers)[0].astype(float) - middle[0] / unit
 
 
-def test_a_loop_without_friction_is_that_of_scipy(pair: Machine) -> None:
+def test_a_loop_without_friction_is_that_of_scipy() -> None:
     u = np.zeros(200)
     u[20:90] = 0.4
     u[90:] = -0.3
-    path = simulate(pair, u, delay_s=DELAY_S)
-    fine, late = 20, round(DELAY_S / pair.period_s)
+    path = simulate(u, delay_s=DELAY_S)
+    fine, late = 20, round(DELAY_S / PAIR.period_s)
     held = np.repeat(np.concatenate([np.zeros(late), u[:-late]]), fine)
     w = 1.0 / RESPONSE_S
     system = ([[0.0, 1.0], [-w * w, -2.0 * DAMPING * w]], [[0.0], [w * w]], [[1.0, 0.0]], [[0.0]])
-    _, expected, _ = lsim(system, held, pair.period_s / fine * np.arange(len(held)), interp=False)
+    _, expected, _ = lsim(system, held, PAIR.period_s / fine * np.arange(len(held)), interp=False)
     # Four explicit steps a period of 20 ms.
     assert np.abs(path - expected[::fine]).max() < 0.03
 
 
-def test_a_servo_under_a_steady_target_does_not_follow_its_own_measured_motion(
-    pair: Machine,
-) -> None:
+def test_a_servo_under_a_steady_target_does_not_follow_its_own_measured_motion() -> None:
     """Nor is it told of it by a sag that depends on the place."""
     numbers = SERVO.list_values("mean")
     for name, value in {"sag": 0.1, "sag_pose_1": -0.5, "sag_pose_2": 0.2}.items():
         numbers[SERVO.place[name]] = value
-    side = stand_still(pair, np.full((300, 2), 0.25))
+    side = stand_still(PAIR, np.full((300, 2), 0.25))
     q = side.q.copy()
     q[1:] += np.random.default_rng(1).normal(0.0, 0.02, (299, 2)).cumsum(0)
     path = side.simulate(0, numbers)[0]
@@ -127,29 +123,29 @@ def test_a_servo_under_a_steady_target_does_not_follow_its_own_measured_motion(
     assert np.ptp(path) > 0.1  # it moves to its target
 
 
-def test_dry_friction_holds_a_joint_beside_its_target(pair: Machine) -> None:
+def test_dry_friction_holds_a_joint_beside_its_target() -> None:
     up = np.linspace(0.0, 0.4, 150)
     u = np.concatenate([up, up[::-1], np.zeros(50)])
-    path = simulate(pair, u, dry=0.05)
+    path = simulate(u, dry=0.05)
     # On the way back the joint is late by twice the friction over the stiffness.
     forth, back = np.interp(0.2, up, path[:150]), np.interp(0.2, up, path[299:149:-1])
-    lag = 2.0 * 2.0 * DAMPING * RESPONSE_S * 0.4 / (149 * pair.period_s)
+    lag = 2.0 * 2.0 * DAMPING * RESPONSE_S * 0.4 / (149 * PAIR.period_s)
     assert back - forth == pytest.approx(2.0 * 0.05 + lag, abs=0.01)
 
 
-def test_a_limited_pull_reaches_the_speed_at_which_its_damping_takes_it_all(pair: Machine) -> None:
+def test_a_limited_pull_reaches_the_speed_at_which_its_damping_takes_it_all() -> None:
     u = np.full(100, 0.9)
     u[0] = 0.0
     shortage, inside = 4.0, 0.5
-    path = simulate(pair, u, shortage=shortage, firmware_damping=inside)
-    speed = np.diff(path)[18:26].max() / pair.period_s
+    path = simulate(u, shortage=shortage, firmware_damping=inside)
+    speed = np.diff(path)[18:26].max() / PAIR.period_s
     outside_s = 2.0 * (1.0 - inside) * DAMPING * RESPONSE_S
     assert speed == pytest.approx(0.1 / shortage / outside_s, rel=0.03)
 
 
-def test_a_joint_falls_where_the_limit_is_below_its_weight(pair: Machine) -> None:
-    held = simulate(pair, np.zeros(100), sag=0.03, shortage=2.0)
-    falls = simulate(pair, np.zeros(100), sag=0.06, shortage=2.0)
+def test_a_joint_falls_where_the_limit_is_below_its_weight() -> None:
+    held = simulate(np.zeros(100), sag=0.03, shortage=2.0)
+    falls = simulate(np.zeros(100), sag=0.06, shortage=2.0)
     assert held[-1] == pytest.approx(-0.03, abs=1e-3)
     assert falls[-1] < -0.3
 
@@ -190,39 +186,37 @@ def test_weight_pulls_a_joint_from_its_target() -> None:
     [(0.0, 0.0, []), (0.2, 0.0, ["frame_loss"]), (0.0, 0.08, ["delay_jitter"])],
 )
 def test_late_and_lost_frames_of_servos_are_named(
-    pair: Machine, lost: float, late_s: float, named: list[str]
+    lost: float, late_s: float, named: list[str]
 ) -> None:
-    field = record_pair(pair, (4, 5), lost=lost, late_s=late_s)
-    answer = diagnose(GapCase(pair, record_pair(pair, (1, 2, 3)), field))
+    field = record_pair((4, 5), lost=lost, late_s=late_s)
+    answer = diagnose(GapCase(PAIR, record_pair((1, 2, 3)), field))
     assert [one.effect for one in answer.selected][:1] == named
 
 
 @pytest.mark.parametrize(
     ("late", "joints"), [(3, [1]), pytest.param(2, [0, 1], marks=pytest.mark.slow)]
 )
-def test_late_servos_are_named_with_their_delay(
-    pair: Machine, late: int, joints: list[int]
-) -> None:
+def test_late_servos_are_named_with_their_delay(late: int, joints: list[int]) -> None:
     field = []
-    for one in record_pair(pair, (4, 5)):
+    for one in record_pair((4, 5)):
         q = one.q.copy()
         q[late:, joints] = one.q[:-late, joints]
         field.append(replace(one, q=q))
-    answer = diagnose(GapCase(pair, record_pair(pair, (1, 2, 3)), field))
-    names = tuple(pair.joint_names[j] for j in joints)
+    answer = diagnose(GapCase(PAIR, record_pair((1, 2, 3)), field))
+    names = tuple(PAIR.joint_names[j] for j in joints)
     assert [(one.effect, one.joints) for one in answer.selected] == [("dead_time", names)]
     for name in names:
         estimate = answer.selected[0].parameters["dead_time_s"][name]
-        assert estimate.mean == pytest.approx(late * pair.period_s, rel=0.1)
+        assert estimate.mean == pytest.approx(late * PAIR.period_s, rel=0.1)
 
 
 @pytest.mark.parametrize("factor", [pytest.param(0.6, marks=pytest.mark.slow), 1.5])
-def test_another_damping_is_named_alone_with_its_size(pair: Machine, factor: float) -> None:
+def test_another_damping_is_named_alone_with_its_size(factor: float) -> None:
     field = []
-    changed = record_pair(pair, (4, 5), damping=factor * ARM_DAMPING)
-    for one, other in zip(record_pair(pair, (4, 5)), changed, strict=True):
+    changed = record_pair((4, 5), damping=factor * ARM_DAMPING)
+    for one, other in zip(record_pair((4, 5)), changed, strict=True):
         field.append(replace(one, q=np.stack([one.q[:, 0], other.q[:, 1]], 1)))
-    answer = diagnose(GapCase(pair, record_pair(pair, (1, 2, 3)), field))
+    answer = diagnose(GapCase(PAIR, record_pair((1, 2, 3)), field))
     assert [(one.effect, one.joints) for one in answer.selected] == [("damping", ("pitch",))]
     estimate = answer.selected[0].parameters["factor"]["pitch"]
     assert estimate.mean == pytest.approx(factor, rel=0.1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from composed import option
+from composed import MACHINE, option
 from warp_states import copy_state
 
 from brokk_rl.errors import DeviceError
@@ -136,24 +136,24 @@ WARP = replace(option("sim", "warp"), num_worlds=NUM_WARP_WORLDS, parity_worlds=
 NATIVE = NativeSimulator(num_worlds=NUM_WARP_WORLDS, substeps=5, num_threads=2)
 
 
-def _motion(machine, steps, push):
+def _motion(steps, push):
     """Yields smooth random increments; `push` lowers the second joint all the while."""
     generator = torch.Generator().manual_seed(0)
-    velocity = torch.zeros(NUM_WARP_WORLDS, machine.num_joints)
-    speed = 1.5 * torch.tensor(machine.max_speed, dtype=torch.float32)
+    velocity = torch.zeros(NUM_WARP_WORLDS, MACHINE.num_joints)
+    speed = 1.5 * torch.tensor(MACHINE.max_speed, dtype=torch.float32)
     for _ in range(steps):
         velocity = 0.9 * velocity + 0.1 * speed * torch.randn(velocity.shape, generator=generator)
         velocity[:, 1] += push
-        yield velocity * machine.period_s
+        yield velocity * MACHINE.period_s
 
 
 @pytest.mark.slow
-def test_a_control_step_is_that_of_mujoco_warp(machine):
+def test_a_control_step_is_that_of_mujoco_warp():
     """From the same state, in the air and pressed onto the ground."""
-    ours, whole = WARP.build(machine, "cpu"), WARP.build(machine, "cpu")
+    ours, whole = WARP.build(MACHINE, "cpu"), WARP.build(MACHINE, "cpu")
     whole._substep = lambda: mujoco_warp.step(whole._model, whole._data)
     pressed = 0.0
-    for increment in _motion(machine, steps=40, push=0.006):
+    for increment in _motion(steps=40, push=0.006):
         whole.load_state_dict(ours.state_dict())
         ours.step(increment)
         whole.step(increment)
@@ -162,11 +162,11 @@ def test_a_control_step_is_that_of_mujoco_warp(machine):
     assert pressed > 1_000.0
 
 
-def test_a_device_that_a_simulator_cannot_use_is_an_error_that_says_what_to_do(machine):
+def test_a_device_that_a_simulator_cannot_use_is_an_error_that_says_what_to_do():
     auto = AutoSimulator(native=NATIVE, warp=WARP)
     with pytest.raises(DeviceError, match="sim=warp"):
-        NATIVE.build(machine, torch.device("cuda"))
+        NATIVE.build(MACHINE, torch.device("cuda"))
     for spec in (WARP, auto) * (not torch.cuda.is_available()):
         with pytest.raises(DeviceError, match="sim=native"):
-            spec.build(machine, "cuda")
-    assert isinstance(auto.build(machine, "cpu", num_worlds=3), NativeWorld)
+            spec.build(MACHINE, "cuda")
+    assert isinstance(auto.build(MACHINE, "cpu", num_worlds=3), NativeWorld)

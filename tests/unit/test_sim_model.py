@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from composed import MACHINE
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import ConfigError
@@ -13,32 +14,32 @@ from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import ScenePlacement, build_collision_geoms, make_nominal_scenes
 
 
-def test_numbers_of_the_machine_stand_in_the_model(machine):
-    model = compile_model(machine, 0.01)
-    np.testing.assert_allclose(model.jnt_range, np.stack([machine.lower, machine.upper], 1))
-    masses = [model.body(f"{joint.name}_link").mass[0] for joint in machine.joints]
+def test_numbers_of_the_machine_stand_in_the_model():
+    model = compile_model(MACHINE, 0.01)
+    np.testing.assert_allclose(model.jnt_range, np.stack([MACHINE.lower, MACHINE.upper], 1))
+    masses = [model.body(f"{joint.name}_link").mass[0] for joint in MACHINE.joints]
     numbers = {"mass_kg": masses, "stiffness": model.actuator_gainprm[:, 0]}
     numbers["yield_force"] = model.actuator_forcerange[:, 1]
     for name, found in numbers.items():
-        expected = [getattr(body, name).value for body in machine.bodies]
+        expected = [getattr(body, name).value for body in MACHINE.bodies]
         np.testing.assert_allclose(found, expected, err_msg=name)
-    assert [model.actuator(i).name for i in range(model.nu)] == list(machine.joint_names)
+    assert [model.actuator(i).name for i in range(model.nu)] == list(MACHINE.joint_names)
 
 
-def test_pictures_do_not_change_the_physics(machine):
-    models = [compile_model(machine, 0.01, visual=visual) for visual in (False, True)]
+def test_pictures_do_not_change_the_physics():
+    models = [compile_model(MACHINE, 0.01, visual=visual) for visual in (False, True)]
     finals = []
     for model in models:
         data = mujoco.MjData(model)
-        data.qpos[:] = data.act[:] = machine.home
+        data.qpos[:] = data.act[:] = MACHINE.home
         data.ctrl[:] = 0.1
         mujoco.mj_step(model, data, 200)
         finals.append(data.qpos.copy())
     np.testing.assert_allclose(*finals, rtol=0, atol=1e-9)
 
 
-def test_joints_that_do_not_match_are_named(machine):
-    other = dataclasses.replace(machine, joints=machine.joints[:4], levers=())
+def test_joints_that_do_not_match_are_named():
+    other = dataclasses.replace(MACHINE, joints=MACHINE.joints[:4], levers=())
     with pytest.raises(ConfigError, match=r"missing: none, unknown: q5"):
         compile_model(other, 0.01)
 
@@ -59,8 +60,8 @@ def test_a_hole_has_walls_all_round_and_nothing_inside(scale, radius_m):
         assert (inside == expected).all()
 
 
-def test_scenes_become_the_geoms_of_their_block(machine):
-    model = compile_model(machine, 0.01)
+def test_scenes_become_the_geoms_of_their_block():
+    model = compile_model(MACHINE, 0.01)
     placement = ScenePlacement(model, "cpu", torch.float64)
     scene = make_nominal_scenes(2)
     scene[1, 3:6] = torch.tensor([0.3, 1.1, 0.06])
@@ -75,8 +76,8 @@ def test_scenes_become_the_geoms_of_their_block(machine):
     np.testing.assert_allclose(turn[1], [np.cos(0.15), 0, 0, np.sin(0.15)], atol=1e-7)
 
 
-def test_a_block_that_leans_turns_its_hole_away_from_the_machine_and_stands_on_nothing(machine):
-    placement = ScenePlacement(compile_model(machine, 0.01), "cpu", torch.float64)
+def test_a_block_that_leans_turns_its_hole_away_from_the_machine_and_stands_on_nothing():
+    placement = ScenePlacement(compile_model(MACHINE, 0.01), "cpu", torch.float64)
     scene = make_nominal_scenes(1)
     hole_m, yaw_rad, lean_rad = [1.5, 2.0], 0.4, 0.2
     scene[0, :2], scene[0, 3], scene[0, 6] = torch.tensor(hole_m), yaw_rad, lean_rad
@@ -87,8 +88,8 @@ def test_a_block_that_leans_turns_its_hole_away_from_the_machine_and_stands_on_n
     assert placement.geoms(scene)[1][0, -1, 2] < -5.0
 
 
-def test_bounding_volumes_hold_every_block(machine):
-    model = compile_model(machine, 0.01)
+def test_bounding_volumes_hold_every_block():
+    model = compile_model(MACHINE, 0.01)
     placement = ScenePlacement(model, "cpu", torch.float64)
     scene = make_nominal_scenes(4)
     scene[:, 4:6] = torch.tensor([[0.5, 0.01], [1.25, 0.01], [0.5, 0.08], [9.0, 9.0]])

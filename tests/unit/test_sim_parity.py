@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -50,37 +50,37 @@ CHANGES: dict[str, tuple[str, str]] = {
 """Parts that an MJCF may have: the text of the shipped one, and what stands there instead."""
 
 
-def change_mjcf(machine: Machine, folder, change: tuple[str, str]) -> Machine:
+def change_mjcf(folder, change: tuple[str, str]) -> Machine:
     """Return the machine with a changed MJCF."""
-    text = (ASSETS / machine.mjcf).read_text()
+    text = (ASSETS / MACHINE.mjcf).read_text()
     assert change[0] in text
     (folder / "changed.xml").write_text(text.replace(*change))
-    return dataclasses.replace(machine, mjcf=str(folder / "changed.xml"))
+    return dataclasses.replace(MACHINE, mjcf=str(folder / "changed.xml"))
 
 
-def make_warp(machine: Machine):
+def make_warp():
     """Return worlds of `sim=warp` on the CPU, not yet compared, with a solver that goes to its end."""
     simulator = dataclasses.replace(
         option("sim", "warp"), parity_worlds=0, iterations=50, linesearch_iterations=50
     )
-    return simulator.build(machine, "cpu", NUM_WORLDS)
+    return simulator.build(MACHINE, "cpu", NUM_WORLDS)
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_each_part_matters_so_that_leaving_it_out_would_be_seen(machine, tmp_path, name):
+def test_each_part_matters_so_that_leaving_it_out_would_be_seen(tmp_path, name):
     """MuJoCo C with the part in place of the simulator, and without it as the reference."""
-    changed = change_mjcf(machine, tmp_path, CHANGES[name])
+    changed = change_mjcf(tmp_path, CHANGES[name])
     try:
         world = NATIVE.build(changed, "cpu")
     except ConfigError:
         return
-    result = measure_parity(world, machine, SUBSTEPS)
+    result = measure_parity(world, MACHINE, SUBSTEPS)
     assert not result.is_alike, result.describe()
 
 
 @pytest.mark.slow
-def test_the_shipped_machine_is_alike_in_all_worlds(machine):
-    result = check_parity(make_warp(machine), machine, SUBSTEPS)
+def test_the_shipped_machine_is_alike_in_all_worlds():
+    result = check_parity(make_warp(), MACHINE, SUBSTEPS)
     assert result.num_different == 0 and result.num_touching >= 10
     assert result.position_error.max() < POSITION_TOLERANCE / 5
 
@@ -88,8 +88,8 @@ def test_the_shipped_machine_is_alike_in_all_worlds(machine):
 class Spoiled:
     """A native world of which one thing is wrong."""
 
-    def __init__(self, machine: Machine, fault: str) -> None:
-        self._world, self._fault = NATIVE.build(machine, "cpu"), fault
+    def __init__(self, fault: str) -> None:
+        self._world, self._fault = NATIVE.build(MACHINE, "cpu"), fault
         self.num_worlds, self.device = NUM_WORLDS, torch.device("cpu")
 
     def __getattr__(self, name: str) -> Any:
@@ -108,18 +108,18 @@ class Spoiled:
 
 
 @pytest.mark.parametrize("fault", ["motion", "force", "nan", "fault", ""])
-def test_a_simulator_that_is_wrong_is_refused_with_figures(machine, fault):
+def test_a_simulator_that_is_wrong_is_refused_with_figures(fault):
     if not fault:
-        result = check_parity(Spoiled(machine, ""), machine, SUBSTEPS)
+        result = check_parity(Spoiled(""), MACHINE, SUBSTEPS)
         assert result.num_different == 0 and result.position_error.max() == 0.0
         return
     with pytest.raises(ConfigError, match=r"as MuJoCo C does: 32 random states"):
-        check_parity(Spoiled(machine, fault), machine, SUBSTEPS)
+        check_parity(Spoiled(fault), MACHINE, SUBSTEPS)
 
 
-def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
+def test_refusals_name_only_backends_that_simulate_the_part(tmp_path):
     def refuse(name: str) -> str:
-        model = compile_model(change_mjcf(machine, tmp_path, CHANGES[name]), 0.01)
+        model = compile_model(change_mjcf(tmp_path, CHANGES[name]), 0.01)
         with pytest.raises(ConfigError) as refusal:
             check_simulated(model, "brokk170", is_warp=True)
         return str(refusal.value)
@@ -127,13 +127,13 @@ def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
     assert refuse("friction").endswith("choose sim=native")
     assert refuse("no actuation").endswith("from the MJCF")
     with pytest.raises(ConfigError, match=r"sim=native.*actuation=disable"):
-        NATIVE.build(change_mjcf(machine, tmp_path, CHANGES["no actuation"]), "cpu", 1)
+        NATIVE.build(change_mjcf(tmp_path, CHANGES["no actuation"]), "cpu", 1)
 
 
-def test_actuators_in_an_mjcf_are_refused(machine, tmp_path):
+def test_actuators_in_an_mjcf_are_refused(tmp_path):
     own = "</worldbody>", '</worldbody><actuator><motor name="winch" joint="q3"/></actuator>'
     with pytest.raises(ConfigError, match=r"has actuators \(winch\)"):
-        compile_model(change_mjcf(machine, tmp_path, own), 0.01)
+        compile_model(change_mjcf(tmp_path, own), 0.01)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_actuators_in_an_mjcf_are_refused(machine, tmp_path):
     ],
 )
 def test_an_arm_that_does_not_stand_where_the_yaml_has_it_is_refused_by_its_joint(
-    machine, tmp_path, joint, change
+    tmp_path, joint, change
 ):
     with pytest.raises(ConfigError, match=rf"m away in random poses: joint {joint} "):
-        compile_model(change_mjcf(machine, tmp_path, change), 0.01)
+        compile_model(change_mjcf(tmp_path, change), 0.01)

@@ -5,6 +5,7 @@ import types
 
 import numpy as np
 import pytest
+from composed import MACHINE
 
 from brokk_rl.errors import StorageError
 from brokk_rl.sim import video
@@ -13,26 +14,26 @@ from brokk_rl.sim.scene import make_nominal_scenes
 
 
 @pytest.fixture
-def motion(machine):
+def motion():
     share = np.linspace(0.4, 0.6, 5)[:, None]
     return types.SimpleNamespace(
-        q=machine.lower + share * (machine.upper - machine.lower),
-        u=np.zeros((5, machine.num_joints)),
+        q=MACHINE.lower + share * (MACHINE.upper - MACHINE.lower),
+        u=np.zeros((5, MACHINE.num_joints)),
         force_n=np.zeros(5),
         scene=make_nominal_scenes(1)[0].numpy(),
         target_m=None,
     )
 
 
-def test_without_a_gl_library_there_is_no_video(machine, motion, tmp_path, monkeypatch, caplog):
+def test_without_a_gl_library_there_is_no_video(motion, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(video, "find_renderer", lambda: None)
-    assert video.render_video(machine, motion, tmp_path / "film.mp4") is None
+    assert video.render_video(MACHINE, motion, tmp_path / "film.mp4") is None
     assert "libegl1" in caplog.text and list(tmp_path.iterdir()) == []
 
 
-def test_a_renderer_that_fails_says_why(machine, motion, tmp_path, monkeypatch, caplog):
+def test_a_renderer_that_fails_says_why(motion, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(video, "find_renderer", lambda: "nonsense")
-    assert video.render_video(machine, motion, tmp_path / "film.mp4") is None
+    assert video.render_video(MACHINE, motion, tmp_path / "film.mp4") is None
     assert "MUJOCO_GL=nonsense" in caplog.text and "invalid value" in caplog.text
 
 
@@ -46,14 +47,14 @@ def test_an_unknown_gl_library_falls_back_to_one_that_draws(monkeypatch, caplog)
 
 
 @pytest.mark.slow
-def test_a_gl_library_gives_pictures_of_the_machine(machine, motion, tmp_path):
+def test_a_gl_library_gives_pictures_of_the_machine(motion, tmp_path):
     import imageio.v2 as imageio
 
     if find_renderer() is None:
         pytest.skip("no GL library works here")
-    video.render_video(machine, motion, tmp_path / "film.mp4")
+    video.render_video(MACHINE, motion, tmp_path / "film.mp4")
     picture = imageio.imread(tmp_path / "film_2.png").astype(int)
     yellow = (picture[..., 0] > 180) & (picture[..., 2] < 60)
     assert picture.shape == (540, 1200, 3) and yellow.mean() > 0.01
     with pytest.raises(StorageError, match="cannot write"):
-        video.render_video(machine, motion, tmp_path / "film.mp4" / "film.mp4")
+        video.render_video(MACHINE, motion, tmp_path / "film.mp4" / "film.mp4")

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from composed import MACHINE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actuators.recordings import split
 from actuators.recordings.split import group_by_run, split_runs
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 
@@ -72,9 +72,9 @@ def test_runs_of_one_joint_each_are_shared_out_joint_by_joint() -> None:
         assert (seconds == seconds[0]).all()
 
 
-def test_a_joint_that_is_not_commanded_is_named_with_what_to_record(machine: Machine) -> None:
+def test_a_joint_that_is_not_commanded_is_named_with_what_to_record() -> None:
     first, second = recording([9.0, 9.0, 9.0, 0.0, 9.0], "a"), recording([9.0] * 5, "b")
     runs = group_by_run([first, second])
-    split.check_commanded(runs, machine, 1, "why")
+    split.check_commanded(runs, MACHINE, 1, "why")
     with pytest.raises(RecordingError, match=r"joint q4 .* in 1 \(b\) of 2 runs.*move q4"):
-        split.check_commanded(runs, machine, 2, "why")
+        split.check_commanded(runs, MACHINE, 2, "why")

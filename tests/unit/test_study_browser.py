@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 from browser import SHOWN, Scripted, opening, served, until
-from sitting import MACHINE, Arm, agreed, conductor, done, plan
+from composed import MACHINE
+from sitting import Arm, agreed, conductor, done, plan
 
 from study import tlx
 from study.conductor import Conductor

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from sitting import MACHINE, inserted_after, make_design, plan, recorded
+from composed import MACHINE
+from sitting import inserted_after, make_design, plan, recorded
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from composed import option
+from composed import MACHINE, option
 from conftest import Brokk
-from sitting import MACHINE, make_design
+from sitting import make_design
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics

@@ -8,8 +8,9 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
+from composed import MACHINE
 from scipy import stats
-from sitting import MACHINE, recorded
+from sitting import recorded
 from statsmodels.regression.mixed_linear_model import MixedLM
 
 from brokk_rl.kinematics import compute_tool_kinematics

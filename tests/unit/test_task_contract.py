@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 import training as runs
-from composed import option
+from composed import MACHINE, option
 from kinematic import Kinematic
 
 from brokk_rl.checks import check_task
@@ -88,23 +88,23 @@ def make_training() -> Any:
     return training
 
 
-def test_the_required_contract_is_enough_for_the_checker(machine: Machine) -> None:
-    check_task(HoldStill(), machine)
-    process = HoldStill().build(machine, 1, CPU)
+def test_the_required_contract_is_enough_for_the_checker() -> None:
+    check_task(HoldStill(), MACHINE)
+    process = HoldStill().build(MACHINE, 1, CPU)
     assert not process.offers
 
 
 @pytest.mark.parametrize("name", ["borehole_insertion", "goal_pose"])
-def test_the_shipped_tasks_offer_all_that_is_optional(name: str, machine: Machine) -> None:
-    assert option("task", name).build(machine, 1, CPU).offers == OPTIONAL.keys()
+def test_the_shipped_tasks_offer_all_that_is_optional(name: str) -> None:
+    assert option("task", name).build(MACHINE, 1, CPU).offers == OPTIONAL.keys()
 
 
 def test_a_task_without_optional_contracts_trains_and_is_not_exported(
-    machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     parts: dict[str, Any] = {
         "session": Session(out=str(tmp_path), seed=0, device="cpu"),
-        "machine": machine,
+        "machine": MACHINE,
         "sim": Kinematic(),
         "task": HoldStill(),
         "actuator": option("actuator", "lag"),
@@ -126,11 +126,11 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
 
     policy = TrainedPolicy(path=str(tmp_path), task=None)
     with pytest.raises(ConfigError, match="has no policy that can leave the trainer"):
-        Export(session=parts["session"], machine=machine, task=HoldStill(), policy=policy).run()
+        Export(session=parts["session"], machine=MACHINE, task=HoldStill(), policy=policy).run()
 
 
-def test_the_classical_policy_of_a_task_without_one_is_refused(machine: Machine) -> None:
-    loop = runs.plant(machine, HoldStill()).build(CPU, 4, 8, 0)
+def test_the_classical_policy_of_a_task_without_one_is_refused() -> None:
+    loop = runs.plant(HoldStill()).build(CPU, 4, 8, 0)
     with pytest.raises(ConfigError, match=r"HoldStillProcess. has no classical controller"):
         ClassicalPolicy(task=None).build(loop, 0)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from kinematic import KinematicWorld
 from motion import rest
 from scipy import optimize
@@ -16,7 +16,6 @@ from training import SILENT, plant
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
-from brokk_rl.machine import Machine
 from brokk_rl.sim.scene import COLUMNS, make_nominal_scenes
 from tasks import starts
 from tasks.term_task import ObservedTerm, RewardCurriculum, RewardTerm
@@ -28,17 +27,15 @@ TASKS = ("borehole_insertion", "slanted", "goal_pose")
 class Stage:
     """One or more environments of a task whose arm stands where a test puts it."""
 
-    def __init__(
-        self, machine: Machine, name: str = "borehole_insertion", num_envs: int = 1, **changes: Any
-    ) -> None:
+    def __init__(self, name: str = "borehole_insertion", num_envs: int = 1, **changes: Any) -> None:
         self.task = replace(option("task", name), **changes)
-        self.process: Any = self.task.build(machine, num_envs, CPU)
-        self.world = KinematicWorld(machine, num_envs)
+        self.process: Any = self.task.build(MACHINE, num_envs, CPU)
+        self.world = KinematicWorld(MACHINE, num_envs)
         start = self.process.starts(num_envs, 1)
-        self.history = rest(machine, start["q"], num_envs)
+        self.history = rest(MACHINE, start["q"], num_envs)
         self.process.reset(torch.ones(num_envs, dtype=torch.bool), start)
         self.start = start
-        pose = Kinematics(machine).pose(start["q"])
+        pose = Kinematics(MACHINE).pose(start["q"])
         self.tip_m, self.pitch_rad = pose.tip_in_base_m, pose.pitch_rad
 
     def target_below_tip(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> None:
@@ -65,34 +62,34 @@ def terminations(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_starts_lie_within_the_limits_and_in_the_open(name: str, machine: Machine) -> None:
+def test_starts_lie_within_the_limits_and_in_the_open(name: str) -> None:
     task = option("task", name)
-    start = task.build(machine, 1, CPU).starts(256, 5)
-    lower, upper = torch.tensor(machine.lower), torch.tensor(machine.upper)
+    start = task.build(MACHINE, 1, CPU).starts(256, 5)
+    lower, upper = torch.tensor(MACHINE.lower), torch.tensor(MACHINE.upper)
     margin = task.arms.margin_rad - 1e-5
     assert ((start["q"] >= lower + margin) & (start["q"] <= upper - margin)).all()
-    tip = Kinematics(machine).pose(start["q"]).tip_in_base_m
+    tip = Kinematics(MACHINE).pose(start["q"]).tip_in_base_m
     top = torch.zeros(256) if name == "goal_pose" else start["scene"][:, 2]
     assert (tip[:, 2] > top + task.arms.clearance_m).all() and (tip[:, 2] > task.arms.floor_m).all()
 
 
-def test_starts_are_the_same_for_every_controller(machine: Machine) -> None:
+def test_starts_are_the_same_for_every_controller() -> None:
     task = option("task", "borehole_insertion")
     other = replace(task.classical, gain_1_s=0.1, margin_rad=0.3, straight=False, damping=1.0)
     both = (task, replace(task, classical=other))
-    first, second = (one.build(machine, 1, CPU).starts(64, 3) for one in both)
+    first, second = (one.build(MACHINE, 1, CPU).starts(64, 3) for one in both)
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def _miss_pose_m(machine: Machine, q: np.ndarray, goal_m: np.ndarray) -> float:
+def _miss_pose_m(q: np.ndarray, goal_m: np.ndarray) -> float:
     """Returns how far SciPy stays from an upright tool at a place, q2 at rest, from four seeds."""
     free, draws = [0, 2, 3, 4], np.random.default_rng(0)
-    lower, upper = machine.lower[free] + 0.03, machine.upper[free] - 0.03
+    lower, upper = MACHINE.lower[free] + 0.03, MACHINE.upper[free] - 0.03
 
     def miss(moved: np.ndarray) -> np.ndarray:
         arm = q.copy()
         arm[free] = moved
-        tool = compute_tool_kinematics(machine, arm)
+        tool = compute_tool_kinematics(MACHINE, arm)
         return np.concatenate((tool.tip_in_base_m - goal_m, tool.axis_in_base - [0.0, 0.0, -1.0]))
 
     ends = []
@@ -102,11 +99,9 @@ def _miss_pose_m(machine: Machine, q: np.ndarray, goal_m: np.ndarray) -> float:
     return min(float(np.abs(end.fun).max()) for end in ends)
 
 
-def test_another_solver_finds_no_pose_either_where_a_start_is_refused_for_it(
-    machine: Machine,
-) -> None:
+def test_another_solver_finds_no_pose_either_where_a_start_is_refused_for_it() -> None:
     task = option("task", "borehole_insertion")
-    search = starts.StartSearch(task, machine)
+    search = starts.StartSearch(task, MACHINE)
     _, part = next(search._draw_chunks(4096, 5))
     (in_range, has_pose, _), _ = search.check(part)
     ready, _ = search._bring_into_range(part["q"], part["target_m"])
@@ -115,13 +110,13 @@ def test_another_solver_finds_no_pose_either_where_a_start_is_refused_for_it(
     for row in refused[:5]:
         q, target_m = ready[row].double().numpy(), part["target_m"][row].double().numpy()
         inside, above = ([0.0, 0.0, up_m] for up_m in (-task.depth_m, task.arms.clearance_m))
-        missed_m = [_miss_pose_m(machine, q, target_m + shift) for shift in (inside, above)]
+        missed_m = [_miss_pose_m(q, target_m + shift) for shift in (inside, above)]
         assert max(missed_m) > 1e-3
 
 
-def test_holes_lie_in_their_ranges_and_the_scene_holds_the_target(machine: Machine) -> None:
+def test_holes_lie_in_their_ranges_and_the_scene_holds_the_target() -> None:
     task = option("task", "borehole_insertion")
-    start = task.build(machine, 1, CPU).starts(256, 5)
+    start = task.build(MACHINE, 1, CPU).starts(256, 5)
     assert torch.equal(start["scene"][:, :3], start["target_m"])
     far = start["target_m"][:, :2].norm(dim=1)
     assert ((far >= 2.3 - 1e-5) & (far <= 3.5 + 1e-5)).all()
@@ -137,20 +132,18 @@ def test_holes_lie_in_their_ranges_and_the_scene_holds_the_target(machine: Machi
     ],
 )
 def test_a_draw_of_which_nothing_can_be_done_ends_with_the_reason(
-    distance_m: tuple[float, float], reason: str, machine: Machine, monkeypatch: pytest.MonkeyPatch
+    distance_m: tuple[float, float], reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(starts, "MIN_CANDIDATES", 1024)
     task = option("task", "borehole_insertion")
     task = replace(task, hole=replace(task.hole, distance_m=distance_m))
-    process = task.build(machine, 1, CPU)
+    process = task.build(MACHINE, 1, CPU)
     with pytest.raises(ConfigError, match="BoreholeInsertion: nearly no start can be") as told:
         process.starts(1, 0)
     assert reason in str(told.value) and "0 of 1024 candidates" in str(told.value)
 
 
-def test_a_draw_of_which_little_can_be_done_goes_on(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_draw_of_which_little_can_be_done_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tried on a chunk in which one candidate in 200 can be done, then one in 300."""
     monkeypatch.setattr(starts, "MIN_CANDIDATES", 1000)
     free = torch.ones(6000, dtype=torch.bool)
@@ -163,19 +156,19 @@ def test_a_draw_of_which_little_can_be_done_goes_on(
 
 
 def test_a_draw_checked_in_parts_is_the_draw_checked_at_once(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    process = option("task", "borehole_insertion").build(machine, 1, CPU)
+    process = option("task", "borehole_insertion").build(MACHINE, 1, CPU)
     whole = process.starts(100, 2)
     monkeypatch.setattr(starts, "CHUNK", 64)
     parts = process.starts(100, 2)
     torch.testing.assert_close(parts, whole, rtol=0.0, atol=1e-4)
 
 
-def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
-    process = option("task", "goal_pose").build(machine, 1, CPU)
+def test_a_draw_with_no_arm_in_the_open_is_just_empty() -> None:
+    process = option("task", "goal_pose").build(MACHINE, 1, CPU)
     nothing = {name: value[:0] for name, value in process.starts(1, 0).items()}
-    passed, _ = starts.StartSearch(process.task, machine).check(nothing)
+    passed, _ = starts.StartSearch(process.task, MACHINE).check(nothing)
     assert [part.shape for part in passed] == [(0,)] * (len(starts.CONDITIONS) - 1)
 
 
@@ -289,8 +282,8 @@ def test_closeness_grows_on_the_way_from_none_to_one(name: str) -> None:
     assert closeness[-1] == pytest.approx(1.0, abs=1e-5)
 
 
-def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> None:
-    stage = Stage(machine)
+def test_a_start_in_contact_ends_at_once_with_no_reward() -> None:
+    stage = Stage()
     stage.world.contact_force_n.fill_(500.0)
     end, reason = stage.end()
     assert end.terminated.item() and not end.timed_out.item() and end.reward.item() == 0.0
@@ -298,19 +291,19 @@ def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> Non
 
 
 @pytest.mark.parametrize("joint", range(5))
-def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine: Machine) -> None:
-    stage = Stage(machine)
+def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int) -> None:
+    stage = Stage()
     stage.step()
-    stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.011
+    stage.history.q[0, -1, joint] = float(MACHINE.upper[joint]) - 0.011
     assert not stage.step().terminated.item(), "11 mrad from the end of the travel is still inside"
-    stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.009
+    stage.history.q[0, -1, joint] = float(MACHINE.upper[joint]) - 0.009
     end, reason = stage.end()
     assert reason == "joint_limit" and end.terminated.item() and not end.timed_out.item()
     assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
 
 
-def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine: Machine) -> None:
-    stage = Stage(machine, episode_s=1.0)
+def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step() -> None:
+    stage = Stage(episode_s=1.0)
     stage.process.state["steps"].fill_(18.0)  # what rsl-rl does through episode_length_buf
     stage.world.contact_force_n.fill_(500.0)
     assert stage.end()[1] == "start_in_contact"
@@ -318,8 +311,8 @@ def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine:
     assert stage.step().timed_out.item()
 
 
-def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) -> None:
-    stage = Stage(machine)
+def test_a_fault_ends_the_episode_without_reward_or_success() -> None:
+    stage = Stage()
     stage.target_below_tip(z_m=-0.12)
     stage.world.faults.fill_(True)
     end, reason = stage.end()
@@ -327,9 +320,9 @@ def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) ->
     assert stage.process.episode["success_strict"].item() == 0.0
 
 
-def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
+def test_success_ends_the_episode_only_where_it_shall() -> None:
     for switch in ({}, {"success": None}):
-        stage = Stage(machine, termination=terminations(**switch))
+        stage = Stage(termination=terminations(**switch))
         stage.step()
         stage.target_below_tip(z_m=-0.12)
         end, reason = stage.end()
@@ -338,8 +331,8 @@ def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
         assert stage.process.episode["success_strict"].item() == 1.0
 
 
-def test_a_row_is_done_hole_by_hole_and_the_tool_drawn_out_between(machine: Machine) -> None:
-    stage = Stage(machine, "several", noise=noise())
+def test_a_row_is_done_hole_by_hole_and_the_tool_drawn_out_between() -> None:
+    stage = Stage("several", noise=noise())
     state = stage.process.state
     for hole in range(3):
         stage.target_below_tip(z_m=-0.12)
@@ -360,15 +353,15 @@ def test_a_row_is_done_hole_by_hole_and_the_tool_drawn_out_between(machine: Mach
     assert stage.process.episode["success_strict"].item() == 1.0
 
 
-def test_rows_that_leave_the_reach_are_refused(machine: Machine) -> None:
+def test_rows_that_leave_the_reach_are_refused() -> None:
     task: Any = option("task", "several")
     wide = replace(task, row=replace(task.row, spacing_m=20.0))
     with pytest.raises(ConfigError, match=r"change task\.row\.spacing_m"):
-        wide.build(machine, 2, CPU).starts(2, seed=0)
+        wide.build(MACHINE, 2, CPU).starts(2, seed=0)
 
 
-def test_a_block_that_is_struck_gives_way_once(machine: Machine) -> None:
-    loop = plant(machine, option("task", "several")).build(CPU, 2, 8, 0)
+def test_a_block_that_is_struck_gives_way_once() -> None:
+    loop = plant(option("task", "several")).build(CPU, 2, 8, 0)
     world: Any = loop.world
     loop.step(torch.zeros(2, 5))  # contact in the first step would void the episode
     before_m = loop.task.state["start.scene"][:, :2].clone()
@@ -381,11 +374,11 @@ def test_a_block_that_is_struck_gives_way_once(machine: Machine) -> None:
     assert not mask.any()
 
 
-def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
+def test_the_figures_of_a_scripted_episode() -> None:
     """Five steps of 50 ms: commands 0.5, 0.5, -0.5 of q1 and still; 30 mm beside the hole, then inside at 0.2 s, then out again."""
     task = option("task", "borehole_insertion")
     action = replace(task.action, kind="direct", scale=1.0, limits=False)
-    stage = Stage(machine, termination=terminations(success=None), action=action)
+    stage = Stage(termination=terminations(success=None), action=action)
     stage.process.state["lowest"].fill_(-1.0)
     stage.process.state["highest"].fill_(1.0)
     script = [  # command of q1, force, tool from the target
@@ -410,8 +403,8 @@ def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
     assert figures["length"] == 5 and figures["success_strict"] == 1.0
 
 
-def test_an_episode_never_inserted_reports_its_last_lateral_error(machine: Machine) -> None:
-    stage = Stage(machine)
+def test_an_episode_never_inserted_reports_its_last_lateral_error() -> None:
+    stage = Stage()
     for lateral_m in (0.3, 0.2, 0.06):
         stage.target_below_tip(x_m=lateral_m, z_m=0.3)
         stage.step()
@@ -432,10 +425,10 @@ def noise(**changes: Any) -> Any:
     return replace(option("task", "borehole_insertion").noise, **(SILENT | changes))
 
 
-def test_the_mean_filter_gives_the_mean_of_all_samples_so_far(machine: Machine) -> None:
+def test_the_mean_filter_gives_the_mean_of_all_samples_so_far() -> None:
     errors = {}
     for kind in ("none", "mean"):
-        stage = Stage(machine, num_envs=16, noise=noise(target_sample_m=0.01, filter=kind))
+        stage = Stage(num_envs=16, noise=noise(target_sample_m=0.01, filter=kind))
         torch.manual_seed(3)
         errors[kind] = estimates(stage, 20)
     running = errors["none"].cumsum(0) / torch.arange(1, 21)[:, None, None]
@@ -444,9 +437,9 @@ def test_the_mean_filter_gives_the_mean_of_all_samples_so_far(machine: Machine) 
     assert errors["mean"][-1].std() < errors["none"][-1].std() / 3
 
 
-def test_the_bias_is_constant_within_an_episode_and_bounded(machine: Machine) -> None:
+def test_the_bias_is_constant_within_an_episode_and_bounded() -> None:
     torch.manual_seed(0)
-    stage = Stage(machine, num_envs=512, noise=noise(target_bias_m=0.008))
+    stage = Stage(num_envs=512, noise=noise(target_bias_m=0.008))
     errors = estimates(stage, 3)
     torch.testing.assert_close(errors[0], errors[2], rtol=0, atol=1e-6)
     length = errors[0].norm(dim=1)
@@ -462,17 +455,17 @@ def test_a_camera_sees_a_target_worse_with_the_square_of_the_distance() -> None:
     assert law.measure_sample_m(ahead) == 0.0
 
 
-def test_the_papers_noise_is_a_share_of_each_coordinate(machine: Machine) -> None:
+def test_the_papers_noise_is_a_share_of_each_coordinate() -> None:
     torch.manual_seed(0)
-    stage = Stage(machine, num_envs=512, noise=noise(target_relative=0.05))
+    stage = Stage(num_envs=512, noise=noise(target_relative=0.05))
     first, second = (error.abs() / stage.start["target_m"].abs() for error in estimates(stage, 2))
     assert first.max() <= 0.05 + 1e-5 and first.max() > 0.049
     assert not torch.equal(first, second), "white: drawn anew in each sample"
 
 
-def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Machine) -> None:
+def test_positions_and_commands_are_scaled_by_one_factor_an_episode() -> None:
     torch.manual_seed(0)
-    stage = Stage(machine, num_envs=256, noise=noise(q_scale=0.1, u_scale=0.1))
+    stage = Stage(num_envs=256, noise=noise(q_scale=0.1, u_scale=0.1))
     stage.history.q.fill_(1.0)
     stage.history.u.fill_(0.5)
     seen = stage.observe()
@@ -487,9 +480,9 @@ def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Mac
     assert torch.equal(before, stage.process.state["q_scale"])
 
 
-def test_a_scale_of_the_motion_leaves_the_newest_position_as_it_is(machine: Machine) -> None:
+def test_a_scale_of_the_motion_leaves_the_newest_position_as_it_is() -> None:
     torch.manual_seed(0)
-    stage = Stage(machine, num_envs=64, noise=noise(q_scale=0.1, q_scale_of="motion"))
+    stage = Stage(num_envs=64, noise=noise(q_scale=0.1, q_scale_of="motion"))
     stage.history.q.copy_(torch.linspace(0.4, 1.0, 13)[None, :, None].expand(64, 13, 5))
     q = stage.observe()["q"]
     assert torch.allclose(q[:, -1], torch.ones(64, 5), atol=1e-6)
@@ -498,13 +491,11 @@ def test_a_scale_of_the_motion_leaves_the_newest_position_as_it_is(machine: Mach
     assert factor.min() < 0.92 and factor.max() > 1.08
 
 
-def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded(
-    machine: Machine,
-) -> None:
+def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded() -> None:
     """Four worlds. `duration` pays 1 in each step: a quarter of it at first, all of it once all have succeeded."""
     terms = {"time": RewardTerm(function="tasks.terms:duration", weight=1.0)}
     rule = RewardCurriculum(begin={"time": 0.25}, figure="success_reached", success=(0.0, 1.0))
-    stage = Stage(machine, num_envs=4, reward=terms, curriculum=rule)
+    stage = Stage(num_envs=4, reward=terms, curriculum=rule)
     assert stage.step().reward.tolist() == [0.25] * 4
     process, done = stage.process, torch.tensor([True, True, False, False])
     process.episode["success_reached"].copy_(torch.tensor([1.0, 0.0, 1.0, 0.0]))
@@ -520,20 +511,20 @@ def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded(
     assert stage.step().reward.tolist() == [0.25] * 4, "and falls again where they fail"
 
 
-def test_terms_of_ones_own_extend_what_the_critic_sees(machine: Machine) -> None:
+def test_terms_of_ones_own_extend_what_the_critic_sees() -> None:
     term = ObservedTerm(
         function="tasks.terms:tool_pitch", samples=2, mean=1.0, std=0.5, noise=0.0, bias=0.0
     )
-    stage = Stage(machine, privileged={"pitch": term})
-    plain = Stage(machine).process.observe(stage.history)["privileged"]
+    stage = Stage(privileged={"pitch": term})
+    plain = Stage().process.observe(stage.history)["privileged"]
     seen = stage.process.observe(stage.history)["privileged"]
-    pitch_rad = Kinematics(machine).pose(stage.start["q"]).pitch_rad
+    pitch_rad = Kinematics(MACHINE).pose(stage.start["q"]).pitch_rad
     assert seen.shape[1] == plain.shape[1] + 2
     torch.testing.assert_close(seen[:, -1], (pitch_rad - 1.0) / 0.5)
 
 
-def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
-    stage = Stage(machine, "goal_pose", num_envs=4, noise=noise())
+def test_without_noise_the_policy_sees_the_truth() -> None:
+    stage = Stage("goal_pose", num_envs=4, noise=noise())
     expected = {"target_in_base_m": stage.start["target_m"], "q": stage.history.q}
     expected |= {"pitch_rad": stage.start["target_pitch_rad"], "u": stage.history.u}
     torch.testing.assert_close(stage.observe(), expected, rtol=0, atol=1e-6)

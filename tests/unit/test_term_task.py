@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from composed import option
+from composed import MACHINE, option
 from kinematic import Kinematic, KinematicWorld
 from motion import rest
 
@@ -19,7 +19,6 @@ from brokk_rl.checks import check_task
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine
 from brokk_rl.observation import restore_encoder
 from brokk_rl.policy_folder import describe_task
 from brokk_rl.sim.model import compile_model
@@ -96,14 +95,14 @@ def make(**changes: Any) -> Turn:
 class Stage:
     """One environment whose first joint turns at the speeds that a test gives."""
 
-    def __init__(self, machine: Machine, **changes: Any) -> None:
-        self.process: Any = make(**changes).build(machine, 1, CPU)
-        self.world = KinematicWorld(machine, 1)
+    def __init__(self, **changes: Any) -> None:
+        self.process: Any = make(**changes).build(MACHINE, 1, CPU)
+        self.world = KinematicWorld(MACHINE, 1)
         self.start = self.process.starts(1, 1)
-        self.history = rest(machine, self.start["q"])
+        self.history = rest(MACHINE, self.start["q"])
         self.process.reset(torch.ones(1, dtype=torch.bool), self.start)
         self.first = self.process.observe(self.history)["policy"].clone()
-        self.period_s = machine.period_s
+        self.period_s = MACHINE.period_s
 
     def turn(self, speed: float) -> Any:
         q = self.history.q[:, -1].clone()
@@ -113,21 +112,19 @@ class Stage:
 
 
 @pytest.fixture
-def asked(machine: Machine) -> float:
-    return float(make().build(machine, 1, CPU).starts(1, 1)["speed"])
+def asked() -> float:
+    return float(make().build(MACHINE, 1, CPU).starts(1, 1)["speed"])
 
 
-def test_it_keeps_the_contract_of_tasks(machine: Machine) -> None:
-    check_task(make(), machine)
+def test_it_keeps_the_contract_of_tasks() -> None:
+    check_task(make(), MACHINE)
     noisy = term("tasks.terms:tip_position", noise=0.01, bias=0.02, samples=2)
-    check_task(make(observation={"tip": noisy}, privileged={}), machine)
+    check_task(make(observation={"tip": noisy}, privileged={}), MACHINE)
 
 
-def test_the_vector_holds_the_terms_in_order_oldest_sample_first(
-    machine: Machine, asked: float
-) -> None:
-    stage = Stage(machine)
-    lower, upper = torch.tensor(machine.lower[0]), torch.tensor(machine.upper[0])
+def test_the_vector_holds_the_terms_in_order_oldest_sample_first(asked: float) -> None:
+    stage = Stage()
+    lower, upper = torch.tensor(MACHINE.lower[0]), torch.tensor(MACHINE.upper[0])
 
     def scale(q: torch.Tensor) -> float:
         return float((2 * q - lower - upper) / (upper - lower) / 0.5)
@@ -138,19 +135,19 @@ def test_the_vector_holds_the_terms_in_order_oldest_sample_first(
     assert float(stage.first[0, 15]) == pytest.approx((-asked - 1.0) / 2.0)
     stage.turn(0.3)
     seen = stage.process.observe(stage.history)
-    expected = [scale(q0), scale(q0), scale(q0 + 0.3 * machine.period_s)]
+    expected = [scale(q0), scale(q0), scale(q0 + 0.3 * MACHINE.period_s)]
     assert seen["policy"][0, [0, 5, 10]].tolist() == pytest.approx(expected)
     assert float(seen["policy"][0, 15]) == pytest.approx((0.3 - asked - 1.0) / 2.0, abs=1e-4)
     assert seen["privileged"].shape == (1, 1)
 
 
-def test_a_bias_stays_for_an_episode_and_noise_does_not(machine: Machine) -> None:
+def test_a_bias_stays_for_an_episode_and_noise_does_not() -> None:
     torch.manual_seed(0)
     tip = term("tasks.terms:tip_position", bias=0.02)
-    process: Any = make(observation={"tip": tip}).build(machine, 256, CPU)
+    process: Any = make(observation={"tip": tip}).build(MACHINE, 256, CPU)
     start, everywhere = process.starts(256, 1), torch.ones(256, dtype=torch.bool)
-    history = rest(machine, start["q"], 256)
-    true_m = Kinematics(machine).pose(start["q"]).tip_in_base_m
+    history = rest(MACHINE, start["q"], 256)
+    true_m = Kinematics(MACHINE).pose(start["q"]).tip_in_base_m
     errors = []
     for mask in (everywhere, ~everywhere, everywhere):
         process.reset(mask, start)
@@ -158,34 +155,34 @@ def test_a_bias_stays_for_an_episode_and_noise_does_not(machine: Machine) -> Non
     assert torch.equal(errors[0], errors[1]) and not torch.equal(errors[0], errors[2])
     assert 0.019 < errors[0].abs().max() <= 0.0201 and abs(float(errors[0].mean())) < 0.002
     noisy = replace(tip, bias=0.0, noise=0.01)
-    process = make(observation={"tip": noisy}).build(machine, 256, CPU)
+    process = make(observation={"tip": noisy}).build(MACHINE, 256, CPU)
     process.reset(everywhere, start)
     first, again = (process.observe(history)["policy"] - true_m for _ in range(2))
     assert not torch.equal(first, again) and 0.009 < first.abs().max() <= 0.0101
 
 
-def test_success_needs_its_share_of_the_steps_that_count(machine: Machine, asked: float) -> None:
+def test_success_needs_its_share_of_the_steps_that_count(asked: float) -> None:
     """Ten steps; two are not counted, and of the other eight half must hold."""
     for num_good, expected in ((3, 0.0), (4, 1.0)):
-        stage = Stage(machine)
+        stage = Stage()
         ends = [stage.turn(asked if 2 <= i < 2 + num_good else 0.0) for i in range(10)]
         assert stage.process.episode["success_strict"].item() == expected
         assert stage.process.episode["held_share"].item() == pytest.approx(num_good / 8)
         assert [bool(end.timed_out) for end in ends] == [False] * 9 + [True]
-    early = Stage(machine)
+    early = Stage()
     for _ in range(2):
         early.turn(asked)
     assert early.process.episode["held_share"].item() == 0.0, "before after_s"
 
 
-def test_the_reward_is_the_weighted_sum(machine: Machine, asked: float) -> None:
-    stage = Stage(machine)
+def test_the_reward_is_the_weighted_sum(asked: float) -> None:
+    stage = Stage()
     assert stage.turn(asked + 0.3).reward.item() == pytest.approx(2.0 * -0.3, abs=1e-4)
     assert stage.process.episode["reward/penalty"].item() == pytest.approx(-0.6, abs=1e-4)
 
 
-def test_exclusive_joints_move_alone_where_their_command_is_the_largest(machine: Machine) -> None:
-    exclusive = torch.tensor(machine.is_exclusive)
+def test_exclusive_joints_move_alone_where_their_command_is_the_largest() -> None:
+    exclusive = torch.tensor(MACHINE.is_exclusive)
     output = torch.tensor([[0.2, 0.4, 0.0, 0.0, 0.3], [0.2, 0.4, 0.0, 0.0, -3.0]])
     found = term_task.JointAction(scale=0.5, mask=True).command(output, exclusive)
     assert found[0].tolist() == pytest.approx([0.0, 0.2, 0.0, 0.0, 0.0])
@@ -194,14 +191,12 @@ def test_exclusive_joints_move_alone_where_their_command_is_the_largest(machine:
     assert free[1].tolist() == pytest.approx([0.1, 0.2, 0.0, 0.0, -1.0])
 
 
-def test_the_contract_names_each_part_and_gives_the_vector_back(
-    machine: Machine, asked: float
-) -> None:
-    stage = Stage(machine)
+def test_the_contract_names_each_part_and_gives_the_vector_back(asked: float) -> None:
+    stage = Stage()
     described = json.loads(json.dumps(stage.process.describe()))
     assert described["order"] == ["joints (3 x 5)", "error (1 x 1)"] and described["size"] == 16
     assert described["parts"][1]["function"] == f"{__name__}:error"
-    encoder = restore_encoder(machine, described)
+    encoder = restore_encoder(MACHINE, described)
     vector = stage.first.numpy()
     samples = encoder.decode(vector)
     assert samples["joints"].shape == (1, 3, 5) and samples["error"].shape == (1, 1, 1)
@@ -217,22 +212,20 @@ def test_its_description_gives_the_same_terms_back() -> None:
     assert build_node(node, "task") == task
 
 
-def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(tmp_path: Path) -> None:
     contract = json.loads((SHIPPED / "policy.json").read_text())
-    contract["observation"] = make().build(machine, 1, CPU).describe()  # type: ignore[attr-defined]
+    contract["observation"] = make().build(MACHINE, 1, CPU).describe()  # type: ignore[attr-defined]
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match=r"asks for joints \(3 x 5\), error \(1 x 1\)"):
-        PolicyBundle(str(tmp_path), machine)
+        PolicyBundle(str(tmp_path), MACHINE)
 
 
-def test_a_geom_of_the_scene_gives_that_of_the_machine_its_shape(machine: Machine) -> None:
+def test_a_geom_of_the_scene_gives_that_of_the_machine_its_shape() -> None:
     site = find_site(option("task", "flat").scene, option("sim", "native"))
-    rounded, flat = (compile_model(machine, 0.01, site=one).geom("chisel") for one in (None, site))
+    rounded, flat = (compile_model(MACHINE, 0.01, site=one).geom("chisel") for one in (None, site))
     assert (rounded.type.item(), flat.type.item()) == (3, 5)  # a capsule, a cylinder
     ends_m = [float(one.pos[0] + one.size[1]) for one in (rounded, flat)]
-    assert ends_m == pytest.approx([machine.tip_m[0] - 0.04, machine.tip_m[0]])
+    assert ends_m == pytest.approx([MACHINE.tip_m[0] - 0.04, MACHINE.tip_m[0]])
     assert flat.contype == rounded.contype and flat.conaffinity == rounded.conaffinity
 
 
@@ -240,10 +233,10 @@ SITE = """<mujoco><worldbody><geom type="box" pos="{0} {1} {2}" size=".5 .05 .3"
 
 
 @pytest.mark.parametrize("name", ["native", pytest.param("warp", marks=pytest.mark.slow)])
-def test_the_tool_feels_a_wall_of_the_scene(name: str, machine: Machine, tmp_path: Path) -> None:
+def test_the_tool_feels_a_wall_of_the_scene(name: str, tmp_path: Path) -> None:
     """q1 turns the arm to the left, and a wall stands in the way of the tool."""
-    q = torch.tensor(machine.home, dtype=torch.float32)[None]
-    x_m, y_m, z_m = Kinematics(machine).pose(q).tip_in_base_m[0].tolist()
+    q = torch.tensor(MACHINE.home, dtype=torch.float32)[None]
+    x_m, y_m, z_m = Kinematics(MACHINE).pose(q).tip_in_base_m[0].tolist()
     path = tmp_path / "site.xml"
     path.write_text(SITE.format(x_m, y_m + 0.25, z_m, ""))
     simulator = option("sim", name, **({"parity_worlds": 0} if name == "warp" else {}))
@@ -251,7 +244,7 @@ def test_the_tool_feels_a_wall_of_the_scene(name: str, machine: Machine, tmp_pat
     scene[:, 0] = -20.0
     forces, ends = [], []
     for site in (None, find_site(str(path), simulator)):
-        world = simulator.build(machine, "cpu", 1, site=site)
+        world = simulator.build(MACHINE, "cpu", 1, site=site)
         world.reset(torch.ones(1, dtype=torch.bool), q, scene)
         increment = torch.zeros(1, 5)
         increment[0, 0] = 0.02
@@ -266,15 +259,15 @@ def test_the_tool_feels_a_wall_of_the_scene(name: str, machine: Machine, tmp_pat
     assert ends[1] < ends[0] - 0.05, "the wall holds the arm"
 
 
-def test_a_scene_that_cannot_be_built_is_refused(machine: Machine, tmp_path: Path) -> None:
+def test_a_scene_that_cannot_be_built_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "site.xml"
     path.write_text(SITE.format(1, 1, 1, "<body><freejoint/><geom size='.1'/></body>"))
     native: Any = option("sim", "native")
     with pytest.raises(ConfigError, match="must stand still"):
-        native.build(machine, "cpu", 1, site=path)
+        native.build(MACHINE, "cpu", 1, site=path)
     path.write_text("<mujoco><nothing/></mujoco>")
     with pytest.raises(ConfigError, match="is no MJCF"):
-        native.build(machine, "cpu", 1, site=path)
+        native.build(MACHINE, "cpu", 1, site=path)
     with pytest.raises(ConfigError, match=r"expected an MJCF file, got nowhere\.xml"):
         find_site("nowhere.xml", native)
     with pytest.raises(ConfigError, match="sim=kinematic builds no scene"):

@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 import torch
 from axis import driven
-from composed import option
+from composed import MACHINE, option
 
 from actuators import open_loop
 from actuators.contracts import FitTask
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")
 
 
-def test_a_known_valve_is_found(machine: Machine, tmp_path: Path) -> None:
-    joints = tuple(replace(one, body=None) for one in machine.joints[3:])
-    pair = replace(machine, mjcf=None, tool_m=None, joints=joints, exclusive=(), levers=())
+def test_a_known_valve_is_found(tmp_path: Path) -> None:
+    joints = tuple(replace(one, body=None) for one in MACHINE.joints[3:])
+    pair = replace(MACHINE, mjcf=None, tool_m=None, joints=joints, exclusive=(), levers=())
     truth = option("actuator", "valve", dead_time_s=0.28, play=0.03, spool_s=0.06, speed_s=0.05)
     curves = {"curve_extend": (0.0, 0.0, 0.3, 1.0), "curve_retract": (0.0, 0.02, 0.25, 0.7)}
     truth = replace(truth, demand=0.8, knots=(0.0, 0.1, 0.4, 1.0), **curves)
