@@ -29,7 +29,7 @@ ROOMS = (
     Room(("perception",), bound=9_500, budget=9_500),
     Room(("deploy",), bound=7_500, budget=7_500),
     Room(("study",), bound=1_800, budget=1_800),
-    Room(("tests",), bound=26_723, budget=25_000),
+    Room(("tests",), bound=26_726, budget=25_000),
     Room(("benchmarks",), bound=1_863, budget=2_000),
 )
 

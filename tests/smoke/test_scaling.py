@@ -117,6 +117,7 @@ from test_rl_ppo import _algorithm, _learn, _roll_out
 from brokk_rl import distributed
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.ppo import DevicePPO
+from brokk_rl.rl.rollout import CapturedRollout
 from rsl_rl.algorithms import PPO
 name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{distributed.read_rank().local}"
 with TrainingGroup(torch.device(name)) as group:
@@ -130,6 +131,7 @@ with TrainingGroup(torch.device(name)) as group:
             theirs.load(copy.deepcopy(ours.save()), None, strict=True)
             for other in (theirs, alone):
                 other.storage = copy.deepcopy(ours.storage)
+            alone._rollout = CapturedRollout(alone)  # it takes no steps of its own
             for algorithm in (ours, theirs, alone):
                 _learn(algorithm, seed, last)
             rates.append(ours.learning_rate)
@@ -146,8 +148,9 @@ with TrainingGroup(torch.device(name)) as group:
 
 def _learn_together(folder: Path, device: str) -> None:
     (folder / "learn.py").write_text(LEARN)
-    tests = str(Path(__file__).parents[1] / "unit")
-    started(folder, *TORCHRUN, "learn.py", device, PYTHONPATH=tests)
+    tests = Path(__file__).parents[1]
+    paths = os.pathsep.join(map(str, (tests.parent, tests, tests / "unit")))
+    started(folder, *TORCHRUN, "learn.py", device, PYTHONPATH=paths)
 
 
 def test_two_processes_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
