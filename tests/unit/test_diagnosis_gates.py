@@ -69,10 +69,10 @@ def test_an_effect_that_is_named_on_a_joint_may_be_what_locks_it() -> None:
     [({"lag": ["q3"]}, False), ({"quantisation": ["q4"]}, False), ({"quantisation": ["q3"]}, True)],
 )
 def test_a_coarse_sensor_repeats_its_readings_and_jumps(
-    name: str, named: dict[str, list[str]], passes: bool, machine: Machine
+    name: str, named: dict[str, list[str]], passes: bool
 ) -> None:
-    one = [recording(machine)]
-    told = gates.judge_recordings([remark(name, "q3", 0.4)], [], one, one, machine)
+    one = [recording(MACHINE)]
+    told = gates.judge_recordings([remark(name, "q3", 0.4)], [], one, one, MACHINE)
     found = by_name(accept_named_joints(told, named))
     assert found[name.replace(" ", "_")].passed is passes
 
