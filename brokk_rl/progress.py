@@ -42,17 +42,14 @@ class ItemProgress:
         # Tables and figures go to stdout; whoever redirects them still sees the bar.
         # A notebook without ipywidgets would get a warning for each bar.
         console = Console(stderr=True, force_jupyter=False)
-        self._columns = (
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
             TaskProgressColumn() if total == SHARE else MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-        )
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            *self._columns,
             console=console,
             transient=True,
             speed_estimate_period=SPEED_WINDOW_S,
@@ -89,9 +86,17 @@ class ItemProgress:
             log.info("%s: %s", task.description, self.describe())
 
     def describe(self) -> str:
-        """Return what the bar says beside its title: what is done, the note, times so far and left."""
-        texts = [str(column.render(self._bar.tasks[0])).strip() for column in self._columns]
-        return " ".join(filter(None, texts))
+        """Return what is done, how long the rest takes and the note, in words."""
+        task = self._bar.tasks[0]
+        if task.total == SHARE:
+            parts = [f"{task.percentage:.0f}%"]
+        elif task.total is None:
+            parts = [f"{task.completed:g}"]
+        else:
+            parts = [f"{task.completed:g} of {task.total:g}"]
+        if task.time_remaining is not None and not task.finished:
+            parts.append(f"about {task.time_remaining / 60.0:.0f} min left")
+        return ", ".join(filter(None, (*parts, task.fields["note"])))
 
     def __enter__(self) -> Self:
         self._bar.__enter__()
