@@ -42,10 +42,11 @@ class ItemProgress:
         # Tables and figures go to stdout; whoever redirects them still sees the bar.
         # A notebook without ipywidgets would get a warning for each bar.
         console = Console(stderr=True, force_jupyter=False)
+        self._done = TaskProgressColumn() if total == SHARE else MofNCompleteColumn(" of ")
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
-            TaskProgressColumn() if total == SHARE else MofNCompleteColumn(),
+            self._done,
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
             TextColumn("left"),
@@ -88,12 +89,7 @@ class ItemProgress:
     def describe(self) -> str:
         """Return what is done, how long the rest takes and the note, in words."""
         task = self._bar.tasks[0]
-        if task.total == SHARE:
-            parts = [f"{task.percentage:.0f}%"]
-        elif task.total is None:
-            parts = [f"{task.completed:g}"]
-        else:
-            parts = [f"{task.completed:g} of {task.total:g}"]
+        parts = [str(self._done.render(task)).strip()]
         if task.time_remaining is not None and not task.finished:
             parts.append(f"about {task.time_remaining / 60.0:.0f} min left")
         return ", ".join(filter(None, (*parts, task.fields["note"])))

@@ -112,8 +112,8 @@ class Benchmark(SimulatedPlant):
 
     def _time_call(self, step: Callable[[], object]) -> float:
         """Return the seconds of one call, the median over `bench.seconds`."""
-        timer = Timer("step()", globals={"step": step}, num_threads=torch.get_num_threads())
-        return timer.blocked_autorange(min_run_time=self.bench.seconds).median
+        measured = Timer("step()", globals={"step": step}, num_threads=torch.get_num_threads())
+        return measured.blocked_autorange(min_run_time=self.bench.seconds).median
 
 
 def _name_device(device: torch.device) -> str:
