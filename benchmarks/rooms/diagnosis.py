@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. Of 240 machines of a plant written elsewhere: 96/136, 9/32, 4/32, by cb40f7a4.",
+        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. On a plant from elsewhere 96/136, 9/32, 4/32 of 240 by cb40f7a4; of 80 others by 94a49848 37/47, 5/10, 1/11.",
         "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
