@@ -89,7 +89,7 @@ MEASUREMENTS = (
     Measurement(
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
-        conditions="One training from nothing on four GPUs, one seed: 11,010 million steps in 576 s; the machine was lost before 610 s. The policy is the mean of the eight kept checkpoints, its only candidate. 0.95 of the last episodes succeeded; eight trainings of fewer steps: 0.88. "
+        conditions="One training from nothing on four GPUs, one seed: 11,010 million steps in 576 s; the machine was lost before 610 s. The policy is the mean of the eight kept checkpoints, its only candidate. 0.95 of the last episodes succeeded; eight shorter trainings: 0.88 at most. "
         "Failures of earlier policies on these circuits suggested its effects. It moves up to three levers. Baseline: the controller without filter, same starts.",
         commands=tuple(
             command
