@@ -321,12 +321,6 @@ class Stage:
                 self.bus_process._timer.begin()
                 self.bus_process.run_cycle()
 
-    def pause(self, seconds: float) -> None:
-        """Lets time go by in which the bus process stands still: stopped, asleep, or without a processor."""
-        with self._time():
-            for _ in range(round(1e3 * seconds)):
-                self.tick()
-
     def tick(self) -> None:
         """Lets a millisecond go by."""
         self.ms += 1

@@ -33,8 +33,8 @@ DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
 """Where a target may be put: distance from the slew axis and height. Chosen by hand: a block that
 is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
 SHOWN_STATE = {"scene": "start.scene", "target_m": "start.target_m", "estimate_m": "estimate_m"}
-"""What is drawn of the task's state, where it has it: scenes `(N, S)`, see `brokk_rl.sim.scene`, true
-targets in the base frame, `(N, 3)`, and targets as the policy sees them, likewise."""
+"""Drawn parts of the task's state, where it has them, by name: scenes, `(N, S)`, see `brokk_rl.sim.scene`; true
+targets in the base frame, `(N, 3)`; and the same as the policy sees them."""
 KEY_STEP = 0.25
 """Stroke by which one press of a key moves a lever. Chosen by hand: four presses to full speed."""
 PUSH_S = 0.5

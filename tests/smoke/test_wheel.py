@@ -118,7 +118,6 @@ def test_its_page_opens_and_closes(home: Path) -> None:
     )
     told = ""
     try:
-        assert process.stderr is not None
         for line in process.stderr:
             told += line
             if address := re.search(r"http://\S+", line):

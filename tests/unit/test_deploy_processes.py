@@ -45,6 +45,23 @@ def desk(
             yield made
 
 
+@pytest.mark.parametrize(
+    ("fault", "message", "limit_s"),
+    [("estop", "", 0.02), ("drop", "JointPos1", 0.15), ("second_remote", "", 0.1)],
+)
+def test_a_fault_stops_the_machine_in_time(
+    desk: Desk, fault: str, message: str, limit_s: float
+) -> None:
+    desk.set_moving()
+    since_s = desk.fault(fault, message)
+    found_s = desk.still_after(since_s, 0.6).flow_s
+    # before the fault ends: the twin's person may press again at once
+    state = desk.memory.state.read()
+    desk.fault("none")
+    assert found_s <= limit_s + 0.02 * SLACK
+    assert state is not None and state.guard in (GuardState.LATCHED, GuardState.READY)
+
+
 def test_the_pages_stop_needs_nobody_but_the_bus_process(desk: Desk) -> None:
     desk.set_moving()
     since_s = desk.press_stop()

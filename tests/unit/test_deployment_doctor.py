@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from arm import make_machine
+from composed import MACHINE
 from motion import make_recording
 from torch import nn
 
@@ -31,7 +32,7 @@ Loop = Callable[[np.ndarray, int], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy of another maker: a network of two layers with a contract that lists its terms."""
     place, size = tmp_path_factory.mktemp("policy"), sum(number for _, number in TERMS)
     layers = [nn.Linear(size, 24), nn.Tanh(), nn.Linear(24, 5), nn.Tanh()]
@@ -39,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
     for weights, std in zip(network.parameters(), (0.4, 0.2, 0.3, 0.1), strict=True):
         nn.init.normal_(weights, std=std, generator=rng)
     _write_onnx(network, torch.zeros(1, size), place / "policy.onnx")
-    names = machine.joint_names
+    names = MACHINE.joint_names
     terms = [
         {"name": "target", "columns": ["target_x_m", "target_y_m", "target_z_m"], "mean": [2.5, 0, 0.7], "std": 0.5},
         {"name": "q", "columns": [f"q_{name}_rad" for name in names], "samples": SAMPLES, "mean": 0.3, "std": 0.7},
@@ -55,8 +56,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
 
 
 @pytest.fixture(scope="module")
-def policy(folder: Path, machine: Machine) -> LoadedPolicy:
-    return load_policy(str(folder), machine)
+def policy(folder: Path) -> LoadedPolicy:
+    return load_policy(str(folder), MACHINE)
 
 
 def run_loop(
@@ -128,39 +129,37 @@ FAULTS = {
     ("name", "detail"),
     [*((name, "command") for name in FAULTS), ("sign", "observation"), ("frame", "observation")],
 )
-def test_a_mistake_is_named_with_its_field(
-    name: str, detail: str, policy: LoadedPolicy, machine: Machine
-) -> None:
+def test_a_mistake_is_named_with_its_field(name: str, detail: str, policy: LoadedPolicy) -> None:
     hooks, kind, place = FAULTS[name]
-    found = ask(policy, run_loop(policy, machine, detail=detail, **hooks), machine)
+    found = ask(policy, run_loop(policy, MACHINE, detail=detail, **hooks), MACHINE)
     assert found.verdict == "code"
     assert [(one.kind, one.field) for one in found.findings] == [(kind, place)]
     assert found.findings[0].time_s[0] < 0.5
 
 
 @pytest.mark.parametrize("detail", ["command", "advice", "observation"])
-def test_a_right_loop_is_left_alone(detail: str, policy: LoadedPolicy, machine: Machine) -> None:
-    found = ask(policy, run_loop(policy, machine, detail=detail), machine)
+def test_a_right_loop_is_left_alone(detail: str, policy: LoadedPolicy) -> None:
+    found = ask(policy, run_loop(policy, MACHINE, detail=detail), MACHINE)
     assert (found.verdict, found.findings) == ("nothing", ())
 
 
 def test_a_log_that_begins_in_motion_is_judged_where_it_holds_the_history(
-    policy: LoadedPolicy, machine: Machine
+    policy: LoadedPolicy,
 ) -> None:
-    recording = run_loop(policy, machine)
+    recording = run_loop(policy, MACHINE)
     for first, verdict in ((40, "nothing"), (NUM_ROWS - SAMPLES - 1, "cannot_tell")):
-        found = ask(policy, select_rows(recording, slice(first, None)), machine)
+        found = ask(policy, select_rows(recording, slice(first, None)), MACHINE)
         assert found.verdict == verdict, found.reason
 
 
-def test_a_fitted_number_is_the_true_one(policy: LoadedPolicy, machine: Machine) -> None:
-    recording = run_loop(policy, machine, see_q=lambda q, _: q * np.array([1, 1, 1, 0.83, 1]))
-    (finding,) = ask(policy, recording, machine).findings
+def test_a_fitted_number_is_the_true_one(policy: LoadedPolicy) -> None:
+    recording = run_loop(policy, MACHINE, see_q=lambda q, _: q * np.array([1, 1, 1, 0.83, 1]))
+    (finding,) = ask(policy, recording, MACHINE).findings
     assert (finding.kind, finding.field) == ("scale", "q.q4")
     assert finding.parameters["factor"] == pytest.approx(0.83, abs=2e-3)
 
 
-def test_a_signal_that_stops_is_told_with_its_time(policy: LoadedPolicy, machine: Machine) -> None:
+def test_a_signal_that_stops_is_told_with_its_time(policy: LoadedPolicy) -> None:
     kept = {}
 
     def stop(q: np.ndarray, k: int) -> np.ndarray:
@@ -168,39 +167,39 @@ def test_a_signal_that_stops_is_told_with_its_time(policy: LoadedPolicy, machine
             kept["q5"] = q[4]
         return np.append(q[:4], kept["q5"])
 
-    (finding,) = ask(policy, run_loop(policy, machine, see_q=stop), machine).findings
+    (finding,) = ask(policy, run_loop(policy, MACHINE, see_q=stop), MACHINE).findings
     assert (finding.kind, finding.field) == ("stale", "q.q5")
     assert finding.time_s[0] == pytest.approx(3.55, abs=0.16)
 
 
-def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy, machine: Machine) -> None:
+def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy) -> None:
     rng = np.random.default_rng(5)
-    recording = run_loop(policy, machine, vector=lambda v, _: v + 0.2 * rng.standard_normal(len(v)))
-    found = ask(policy, recording, machine)
+    recording = run_loop(policy, MACHINE, vector=lambda v, _: v + 0.2 * rng.standard_normal(len(v)))
+    found = ask(policy, recording, MACHINE)
     assert found.verdict == "code"
     assert [one.kind for one in found.findings] == ["unlisted"]
 
 
-def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy, machine: Machine) -> None:
-    found = ask(policy, run_loop(policy, machine, target_m=(5.5, 0.3, 0.8)), machine)
+def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy) -> None:
+    found = ask(policy, run_loop(policy, MACHINE, target_m=(5.5, 0.3, 0.8)), MACHINE)
     assert found.verdict == "task" and "target.distance" in found.reason
 
 
 @pytest.mark.parametrize(("margin_rad", "verdict"), [(0.05, "nothing"), (-0.05, "task")])
 def test_only_the_pose_at_the_start_is_part_of_the_task(
-    policy: LoadedPolicy, machine: Machine, margin_rad: float, verdict: str
+    policy: LoadedPolicy, margin_rad: float, verdict: str
 ) -> None:
-    recording = run_loop(policy, machine)
+    recording = run_loop(policy, MACHINE)
     start = float(recording.q[0, 1])
     assert np.abs(recording.q[:, 1] - start).max() > 0.2
     ranges = {"q.q2": [start - 0.1 - margin_rad, start + margin_rad]}
     contract = replace(policy.contract, training={"count": 2048, "ranges": ranges})
-    found = ask(replace(policy, contract=contract), recording, machine)
+    found = ask(replace(policy, contract=contract), recording, MACHINE)
     assert found.verdict == verdict
 
 
-def test_a_log_without_the_target_cannot_tell(policy: LoadedPolicy, machine: Machine) -> None:
-    found = ask(policy, replace(run_loop(policy, machine), extra={}), machine)
+def test_a_log_without_the_target_cannot_tell(policy: LoadedPolicy) -> None:
+    found = ask(policy, replace(run_loop(policy, MACHINE), extra={}), MACHINE)
     assert found.verdict == "cannot_tell" and "target_x_m" in found.reason
 
 
@@ -215,9 +214,9 @@ LONGER = {"obs_43": np.zeros(NUM_ROWS, np.float32)}
     ],
 )
 def test_another_rate_and_another_length_are_told(
-    policy: LoadedPolicy, machine: Machine, change: Any, kind: str, field: str
+    policy: LoadedPolicy, change: Any, kind: str, field: str
 ) -> None:
-    found = ask(policy, change(run_loop(policy, machine, detail="observation")), machine)
+    found = ask(policy, change(run_loop(policy, MACHINE, detail="observation")), MACHINE)
     assert (found.findings[0].kind, found.findings[0].field) == (kind, field)
 
 
@@ -228,21 +227,21 @@ class Backwards:
         self.answer = lambda vectors: policy.network.answer(vectors[:, ::-1])
 
 
-def test_another_network_is_told_and_named_if_given(policy: LoadedPolicy, machine: Machine) -> None:
+def test_another_network_is_told_and_named_if_given(policy: LoadedPolicy) -> None:
     other = LoadedPolicy(policy.contract, Backwards(policy))  # type: ignore[arg-type]
-    recording = run_loop(other, machine, detail="observation")
-    (unnamed,) = ask(policy, recording, machine).findings
-    given = Deployment(policy, machine, {"runs/{old}": other})
+    recording = run_loop(other, MACHINE, detail="observation")
+    (unnamed,) = ask(policy, recording, MACHINE).findings
+    given = Deployment(policy, MACHINE, {"runs/{old}": other})
     (named,) = given.examine([recording], None, {}, 0).findings
     assert "another network" in unnamed.text and named.text == "the network is that of runs/{old}"
     assert (unnamed.kind, unnamed.field) == (named.kind, named.field) == ("network", "network")
 
 
-def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machine) -> None:
-    recording = run_loop(policy, machine)
+def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy) -> None:
+    recording = run_loop(policy, MACHINE)
     rounded = np.round(recording.q / 1e-3) * 1e-3
     assert measure_resolution(rounded[:, 0].astype(float)) == pytest.approx(1e-3, rel=1e-2)
-    found = ask(policy, replace(recording, q=rounded.astype(np.float32)), machine)
+    found = ask(policy, replace(recording, q=rounded.astype(np.float32)), MACHINE)
     assert found.verdict == "nothing"
 
 
@@ -263,14 +262,14 @@ PARTS = {"parts": [{"name": "distance", "samples": 1, "width": 3}]}
     ],
 )
 def test_a_contract_that_does_not_fit_is_refused(
-    folder: Path, machine: Machine, tmp_path: Path, change: Callable[[Any], None], told: str
+    folder: Path, tmp_path: Path, change: Callable[[Any], None], told: str
 ) -> None:
     contract = json.loads((folder / "policy.json").read_text())
     change(contract)
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
     with pytest.raises(CheckpointError, match=told):
-        load_policy(str(tmp_path), machine)
+        load_policy(str(tmp_path), MACHINE)
 
 
 def test_a_policy_of_another_machine_is_refused_by_its_joints() -> None:
@@ -279,9 +278,9 @@ def test_a_policy_of_another_machine_is_refused_by_its_joints() -> None:
 
 
 def test_the_doctor_from_the_command(
-    brokk: Callable[..., object], policy: LoadedPolicy, folder: Path, machine: Machine
+    brokk: Callable[..., object], policy: LoadedPolicy, folder: Path
 ) -> None:
-    write_recording(run_loop(policy, machine, see_q=turn_joint), Path("log.parquet"))
+    write_recording(run_loop(policy, MACHINE, see_q=turn_joint), Path("log.parquet"))
     arguments = ("~actuator", "doctor.log=log.parquet", f"policy={folder}", "session.out=out")
     brokk("mode=doctor_policy", *arguments)
     told = json.loads(Path("out/doctor.json").read_text())

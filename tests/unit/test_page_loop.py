@@ -164,9 +164,7 @@ def wanted(
 
 
 def controls(memory: LoopMemory) -> Any:
-    found = memory.controls.read()
-    assert found is not None
-    return found
+    return memory.controls.read()
 
 
 def test_start_arms_and_stop_disarms(memory: LoopMemory, feed: LoopFeed, tmp_path: Path) -> None:

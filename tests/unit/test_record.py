@@ -9,12 +9,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from composed import MACHINE
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 JOINTS = ("q1", "q2", "q3", "q4", "q5")
@@ -69,7 +69,7 @@ def test_the_file_is_what_the_format_says(path: Path) -> None:
     oil=st.booleans(),
 )
 def test_what_is_written_is_read(
-    tmp_path: Path, machine: Machine, num_samples: int, jitter: float, seed: int, oil: bool
+    tmp_path: Path, num_samples: int, jitter: float, seed: int, oil: bool
 ) -> None:
     generator = np.random.default_rng(seed)
     t_s = np.arange(num_samples) * 0.05 + 0.05 * jitter * generator.uniform(-1.0, 1.0, num_samples)
@@ -77,7 +77,7 @@ def test_what_is_written_is_read(
     told = {"source": "test", "seed": str(seed)}
     before = recording(num_samples, t_s=t_s, extra=extra, metadata=told)
     record.write_recording(before, tmp_path / "a.parquet")
-    after = record.read_recording(tmp_path / "a.parquet", machine)
+    after = record.read_recording(tmp_path / "a.parquet", MACHINE)
     np.testing.assert_array_equal(after.t_s, t_s)
     np.testing.assert_array_equal(after.u, before.u.astype(np.float32))
     np.testing.assert_array_equal(after.q, before.q.astype(np.float32))
@@ -98,20 +98,19 @@ def test_what_is_written_is_read(
     ],
 )  # fmt: skip
 def test_a_bad_cell_is_refused_by_name(
-    path: Path, machine: Machine, column: str, row: int, value: float, message: str
+    path: Path, column: str, row: int, value: float, message: str
 ) -> None:
     with pytest.raises(RecordingError, match=rf"run\.parquet: {message}"):
-        record.read_recording(changed(path, column, row, value), machine)
+        record.read_recording(changed(path, column, row, value), MACHINE)
 
 
-def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Machine) -> None:
+def test_every_breach_is_found_with_its_row_and_column(path: Path) -> None:
     commands = [("u_q3", 7, 1.2), ("u_q3", 8, 1.3), ("u_q3", 20, -4.0)]
     for column, row, value in [*commands, ("q_q1_rad", 3, np.nan), ("t_s", 30, 1.45)]:
         changed(path, column, row, value)
     table = pq.read_table(path)
     pq.write_table(table.drop_columns("q_q5_rad"), path)
-    recording_, found = record.examine_recording(path, machine)
-    assert recording_ is not None
+    recording_, found = record.examine_recording(path, MACHINE)
     assert np.isnan(recording_.q[:, 4]).all()
     assert [(breach.column, breach.row, breach.num_rows) for breach in found] == [
         ("q_q5_rad", None, 1), ("q_q1_rad", 3, 1), ("u_q3", 7, 2), ("u_q3", 20, 1), ("t_s", 30, 1), ("t_s", 31, 1),
@@ -119,12 +118,12 @@ def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Mach
     assert str(found[2]).startswith("row 7, column 'u_q3': command 1.2")
 
 
-def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine: Machine) -> None:
+def test_a_missing_column_is_refused_with_the_nearest_names(path: Path) -> None:
     table = pq.read_table(path)
     names = [name.replace("q_q4_rad", "q_q4_deg") for name in table.column_names]
     pq.write_table(table.rename_columns(names).replace_schema_metadata(table.schema.metadata), path)
     with pytest.raises(RecordingError, match=r"'q_q4_rad' is missing; did you mean 'q_q\d_\w+'"):
-        record.read_recording(path, machine)
+        record.read_recording(path, MACHINE)
 
 
 @pytest.mark.parametrize(
@@ -138,32 +137,32 @@ def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine:
     ],
 )
 def test_wrong_metadata_is_refused(
-    path: Path, machine: Machine, metadata: tuple[str, ...] | None, message: str
+    path: Path, metadata: tuple[str, ...] | None, message: str
 ) -> None:
     keys = ("brokk.schema", "brokk.machine", "brokk.rate_hz")
     stated = dict(zip(keys, metadata or (), strict=False))
     pq.write_table(pq.read_table(path).replace_schema_metadata(stated), path)
     with pytest.raises(RecordingError, match=message):
-        record.read_recording(path, machine)
+        record.read_recording(path, MACHINE)
 
 
-def test_a_truncated_file_is_refused(path: Path, machine: Machine) -> None:
+def test_a_truncated_file_is_refused(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(RecordingError, match=r"run\.parquet: truncated or not a Parquet file"):
-        record.read_recording(path, machine)
+        record.read_recording(path, MACHINE)
 
 
-def test_a_column_of_text_is_refused(path: Path, machine: Machine) -> None:
+def test_a_column_of_text_is_refused(path: Path) -> None:
     table = pq.read_table(path)
     pq.write_table(table.set_column(1, "u_q1", pa.array(["0.1"] * len(table))), path)
     with pytest.raises(RecordingError, match="column 'u_q1' holds string, expected numbers"):
-        record.read_recording(path, machine)
+        record.read_recording(path, MACHINE)
 
 
-def test_further_columns_are_kept_and_may_have_gaps(tmp_path: Path, machine: Machine) -> None:
+def test_further_columns_are_kept_and_may_have_gaps(tmp_path: Path) -> None:
     force = np.full(40, np.nan)
     record.write_recording(recording(extra={"force_n": force}), tmp_path / "a.parquet")
-    assert np.isnan(record.read_recording(tmp_path / "a.parquet", machine).extra["force_n"]).all()
+    assert np.isnan(record.read_recording(tmp_path / "a.parquet", MACHINE).extra["force_n"]).all()
 
 
 def test_a_bad_recording_is_not_written(tmp_path: Path) -> None:
