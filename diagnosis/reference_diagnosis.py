@@ -201,6 +201,7 @@ class ReferenceDiagnosis(Diagnosis):
         reference = stack_side(case.reference, machine)
         field = stack_side(correct_positions(case.field, detected, machine), machine)
         decider = Decider(reference, field, self._measure_noise(), self.clock_late_s)
+        decider.recorded = stack_side(case.field, machine)
         tell("simulating every effect", 0.45)
         decision = decider.decide()
         tell("sizes and proof", 0.8)

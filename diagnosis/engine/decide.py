@@ -150,12 +150,16 @@ class Decider:
         field: The machine as it is.
         noises: Standard deviation of the noise that sensors of the field add, `(J,)`, units.
         clock_late_s: By how much the field's positions are known to be late.
+
+    Attributes:
+        recorded: The field as it was recorded, where errors of its encoders are corrected in `field`.
     """
 
     def __init__(
         self, reference: Side, field: Side, noises: np.ndarray, clock_late_s: float = 0.0
     ) -> None:
         self.clock_late_s = clock_late_s
+        self.recorded = field
         self.evidence = RowEvidence(reference, field)
         self.evidence.noises = noises
         self.generic = GenericCauses(self.evidence)
@@ -164,9 +168,7 @@ class Decider:
     def decide(self) -> Decision:
         """Return the decision."""
         coarse = self._find_coarse()
-        known = []
-        if self.clock_late_s:
-            known.append(self._describe_clock())
+        known = [self._describe_clock()] if self.clock_late_s else []
         if coarse:
             known.append(EffectFinding("quantisation", dict.fromkeys(coarse, SHOWN_NATS)))
         table = self.weigh(known)
@@ -224,7 +226,9 @@ class Decider:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""
         found, evidence = [], self.evidence
         for j in np.flatnonzero(evidence.noises == 0.0).tolist():
-            evidence.steps[j] = find_lattice(evidence.field, evidence.reference, j)
+            # The correction of a scale changes the step, too, of a sensor that is as fine as before.
+            if find_lattice(self.recorded, evidence.reference, j):
+                evidence.steps[j] = find_lattice(evidence.field, evidence.reference, j)
             if evidence.steps[j]:
                 found.append(j)
         return found

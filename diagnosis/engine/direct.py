@@ -84,7 +84,8 @@ def _find_step_between(
     size = PADDING * (int(places.max()) + 1)
     lengths = np.abs(np.fft.rfft(np.bincount(places, minlength=size)))[1:] / len(q)
     steps = size * BIN_UNITS / np.arange(1, len(lengths) + 1)
-    nats = _weigh_length(lengths, len(q)) * ((steps >= smallest) & (steps <= largest))
+    weights = lengths**2 + 2.0 * np.maximum(lengths - 0.5, 0.0) ** 2
+    nats = min(len(q), MAX_POSITIONS) * weights * ((steps >= smallest) & (steps <= largest))
     # The first of equally good steps is the largest; its peak is a few frequencies wide.
     best = int(np.argmax(nats > PART_SHARE * nats.max()))
     best += int(np.argmax(nats[best : best + PADDING]))
@@ -99,7 +100,3 @@ def _pick_positions(side: Side, joint: int, step: float) -> np.ndarray:
         picked.append(side.q[begin + side.count(1.0) : end : stride, joint])
     q = np.concatenate(picked)
     return q[np.abs(np.diff(q, prepend=q[0] + 1.0)) > step / 3.0]
-
-
-def _weigh_length(length: np.ndarray, count: int) -> np.ndarray:
-    return min(count, MAX_POSITIONS) * (length**2 + 2.0 * np.maximum(length - 0.5, 0.0) ** 2)

@@ -55,6 +55,14 @@ class Around:
         assert self.flow() == (pytest.approx(FLOW), PC, GatewayState.PC)
         return self
 
+    def stops_within_2_ms(self, state: GatewayState) -> None:
+        assert self.flow()[1] == PC
+        self.now_s += 0.002
+        assert self.is_still(state)
+        self.go(0.1)
+        assert self.is_still(GatewayState.IDLE)
+        self.get_going()
+
     def flow(self) -> tuple[list[float], int, GatewayState]:
         flow, source, state = self.gateway.decide(self.now_s)
         return flow.tolist(), source, state
@@ -134,12 +142,7 @@ def test_a_released_dead_man_stops(around: Around) -> None:
 def test_commands_that_stay_away_stop_and_want_idle_frames_again(around: Around) -> None:
     around.now_s += 0.069
     around.send("LeverState")
-    assert around.flow()[1] == PC
-    around.now_s += 0.002
-    assert around.is_still(GatewayState.TIMEOUT)
-    around.go(0.1)
-    assert around.is_still(GatewayState.IDLE)
-    around.get_going()
+    around.stops_within_2_ms(GatewayState.TIMEOUT)
 
 
 def test_a_remote_that_stays_away_or_is_off_stops_and_wants_idle_frames_again(
@@ -149,12 +152,7 @@ def test_a_remote_that_stays_away_or_is_off_stops_and_wants_idle_frames_again(
         around.now_s += 0.02
         around.send("ValveCmd")
     around.now_s += 0.009
-    assert around.flow()[1] == PC
-    around.now_s += 0.002
-    assert around.is_still(GatewayState.STOPPED)
-    around.go(0.1)
-    assert around.is_still(GatewayState.IDLE)
-    around.get_going()
+    around.stops_within_2_ms(GatewayState.STOPPED)
     around.send("LeverState", RemoteOn=0)
     assert around.is_still(GatewayState.STOPPED)
 

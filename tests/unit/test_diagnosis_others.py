@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +18,9 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library, geometry, sensors
 from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect
+from diagnosis.engine.decide import Decider
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
-
-CPU = torch.device("cpu")
 
 
 def swept(seconds: float, seed: int, noise: float = 3e-4) -> Recording:
@@ -55,32 +56,31 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size() -> None:
     q[:, 1] += 1.5e-3 * np.random.default_rng(4).standard_normal(len(q))
     q[:, 3] = np.round(q[:, 3] / 0.0037) * 0.0037
     kinds = {kind.name: kind for kind in effect_library.load_effects(MACHINE)}
+    noise = kinds["sensor_noise"]
     rough = GapCase(MACHINE, reference, [dataclasses.replace(field, q=q)])
-    found = sensors.find_sensor_noise(rough, kinds["sensor_noise"])
+    found = sensors.find_sensor_noise(rough, noise)
     assert found and found.joints.tolist() == [False, True, False, False, False]
     assert found.parameters["sigma_rad"]["q2"].mean == pytest.approx(1.5e-3, rel=0.15)
     # What shakes a joint after its command has changed is no noise of its sensor.
     shaken, changes = field.q.copy(), np.flatnonzero(np.diff(field.u[:, 2]))
     late = np.minimum(changes[:, None] + np.arange(15), len(shaken) - 1)
     shaken[late, 2] += 2e-3 * np.random.default_rng(5).standard_normal(late.shape)
-    shaking = GapCase(MACHINE, reference, [dataclasses.replace(field, q=shaken)])
-    assert sensors.find_sensor_noise(shaking, kinds["sensor_noise"]) is None
-    sound = GapCase(MACHINE, reference, [field])
-    assert sensors.find_sensor_noise(sound, kinds["sensor_noise"]) is None
+    shaking = dataclasses.replace(field, q=shaken)
+    assert sensors.find_sensor_noise(GapCase(MACHINE, reference, [shaking]), noise) is None
+    assert sensors.find_sensor_noise(GapCase(MACHINE, reference, [field]), noise) is None
     # Noise is told beside the steps of a sensor that is always coarse, though they show in some parts only.
     usual = [swept(100.0, seed, 1e-6) for seed in range(7)]
     for one in usual[2:]:
         one.q[:, 1] = np.round(one.q[:, 1] / 0.004) * 0.004
-    coarse = GapCase(MACHINE, usual[:-1], usual[-1:])
     usual[-1].q[:, 1] += 0.03 * np.random.default_rng(4).standard_normal(len(usual[-1].q))
-    found = sensors.find_sensor_noise(coarse, kinds["sensor_noise"])
+    found = sensors.find_sensor_noise(GapCase(MACHINE, usual[:-1], usual[-1:]), noise)
     assert found and found.parameters["sigma_rad"]["q2"].mean == pytest.approx(0.03, rel=0.1)
 
 
 def tracked(recording: Recording, bias: np.ndarray, tilt_rad: float, seed: int) -> Recording:
     """Returns a recording with tool points as measured beside a machine whose encoders show too much and whose base is tilted."""
     true_q = torch.as_tensor(recording.q - bias, dtype=torch.float32)
-    tip = Kinematics(MACHINE, CPU).pose(true_q).tip_in_base_m.numpy()
+    tip = Kinematics(MACHINE, torch.device("cpu")).pose(true_q).tip_in_base_m.numpy()
     turned = Rotation.from_rotvec([tilt_rad, 0.0, 0.0]).apply(tip)
     seen = turned + 2e-3 * np.random.default_rng(seed).standard_normal(tip.shape)
     columns = dict(zip(geometry.TOOL_COLUMNS, seen.T, strict=True))
@@ -161,7 +161,16 @@ def test_a_lattice_that_motion_blurs_in_the_reference_is_no_coarse_sensor() -> N
 
 
 def test_an_encoder_whose_scale_is_off_is_no_coarser_than_before() -> None:
-    before, after = (swept(300.0, seed) for seed in (0, 1))
-    reference = dataclasses.replace(before, q=np.round(before.q / 0.0015) * 0.0015)
-    field = dataclasses.replace(after, q=1.02 * np.round(after.q / 0.0015) * 0.0015)
-    assert find_lattice(stack_side([field], MACHINE), stack_side([reference], MACHINE), 2) == 0.0
+    sides = []
+    for seed, scale in ((0, 1.0), (1, 1.02), (1, 1.0), (1, 0.77)):
+        one = swept(300.0, seed)
+        fine = dataclasses.replace(one, q=scale * np.round(one.q / 0.0015) * 0.0015)
+        sides.append(stack_side([fine], MACHINE))
+    reference, scaled, recorded, corrected = sides
+    assert find_lattice(scaled, reference, 2) == 0.0
+    # Nor does the correction of a scale make it coarser, though its step is another.
+    assert any(find_lattice(corrected, reference, j) for j in range(5))
+    none = np.zeros(5)
+    evidence = SimpleNamespace(reference=reference, field=corrected, noises=none, steps=none)
+    decider: Any = SimpleNamespace(recorded=recorded, evidence=evidence)
+    assert Decider._find_coarse(decider) == []

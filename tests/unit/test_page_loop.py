@@ -163,6 +163,11 @@ def wanted(
     return RequestHandler(memory, recorder, aim, armed=False, commands=commands), started
 
 
+def ask(feed: LoopFeed, supervisor: RequestHandler, request: OperatorRequest) -> None:
+    feed.submit(request)
+    supervisor.refresh()
+
+
 def controls(memory: LoopMemory) -> Any:
     return memory.controls.read()
 
@@ -176,8 +181,7 @@ def test_start_arms_and_stop_disarms(memory: LoopMemory, feed: LoopFeed, tmp_pat
         supervisor.refresh()
         assert controls(memory).armed == armed
     feed.submit(OperatorRequest("start", ""))
-    feed.submit(OperatorRequest("stop", ""))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("stop", ""))
     assert not controls(memory).armed, "the last word counts"
 
 
@@ -203,13 +207,11 @@ def test_a_start_that_was_asked_for_before_a_stop_does_not_undo_it(
     memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
     supervisor, _ = wanted(memory, tmp_path)
-    feed.submit(OperatorRequest("start", ""))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("start", ""))
     feed.submit(OperatorRequest("stop", ""))
     asked = memory.page.read()  # the supervisor hangs, and still says "armed"
     assert asked is not None and controls(memory).armed_t_s < asked.stopped_s
-    feed.submit(OperatorRequest("start", ""))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("start", ""))
     assert controls(memory).armed and controls(memory).armed_t_s > asked.stopped_s
 
 
@@ -224,8 +226,7 @@ def test_nothing_is_armed_where_nothing_is_ever_sent(
     memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
     supervisor, _ = wanted(memory, tmp_path, commands=False)
-    feed.submit(OperatorRequest("start", ""))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("start", ""))
     assert not controls(memory).armed
 
 
@@ -236,17 +237,14 @@ def test_recordings_begin_and_end_one_at_a_time(
     memory.bus_log.put(b"old")
     supervisor.refresh()
     assert memory.bus_log.waiting == 0, "what nobody records does not pile up"
-    feed.submit(OperatorRequest("record", "on"))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("record", "on"))
     assert [one.folder for one in started] == [tmp_path]
     assert feed.read_state().recording.on
     feed.submit(OperatorRequest("record", "off"))
     feed.submit(OperatorRequest("record", "on"))
-    feed.submit(OperatorRequest("record", "off"))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("record", "off"))
     assert started[0].asked_to_stop and not feed.read_state().recording.on
-    feed.submit(OperatorRequest("record", "on"))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("record", "on"))
     assert len(started) == 1, "the first still writes its last words"
     started[0].code = 0
     supervisor.refresh()
@@ -258,15 +256,13 @@ def test_a_log_that_died_is_not_started_again_in_secret(
     memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
     supervisor, started = wanted(memory, tmp_path)
-    feed.submit(OperatorRequest("record", "on"))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("record", "on"))
     started[0].code = -9
     supervisor.refresh()
     supervisor.refresh()
     assert len(started) == 1 and not feed.read_state().recording.on
     assert feed.read_state().recording.failed, "an alarm, and not as if nobody wanted one"
-    feed.submit(OperatorRequest("record", "on"))
-    supervisor.refresh()
+    ask(feed, supervisor, OperatorRequest("record", "on"))
     assert feed.read_state().recording.on and not feed.read_state().recording.failed
 
 
