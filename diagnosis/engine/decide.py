@@ -224,14 +224,12 @@ class Decider:
 
     def _find_coarse(self) -> list[int]:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""
-        found, evidence = [], self.evidence
+        evidence = self.evidence
         for j in np.flatnonzero(evidence.noises == 0.0).tolist():
             # The correction of a scale changes the step, too, of a sensor that is as fine as before.
             if find_lattice(self.recorded, evidence.reference, j):
                 evidence.steps[j] = find_lattice(evidence.field, evidence.reference, j)
-            if evidence.steps[j]:
-                found.append(j)
-        return found
+        return np.flatnonzero(evidence.steps).tolist()
 
     def _weigh_generic(self, there: Sequence[EffectFinding]) -> tuple[str, float]:
         """Return the group that earns most on all joints, and what it earns, nats."""

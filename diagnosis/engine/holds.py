@@ -42,8 +42,8 @@ POWERS = (0.1, 0.25, 0.5, 1.0)
 Of 20 opened and practice machines with held commands 0.1 earns most on five, 0.25 on nine, 0.5 on four and 1.0 on two.
 """
 LEAST_CHANCE = np.finfo(float).tiny
-IMPOSSIBLE = -1e9
-"""Log chance of what cannot be."""
+IMPOSSIBLE = -100.0
+"""Log chance of what cannot be. No sample says more for or against a delay, or all courses would vanish in rounding."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,8 @@ def average_courses(
         chances: Chance that a delay (first axis) is followed by another one (second), `(K, K)`.
         powers: Powers of the likelihood.
     """
-    likelihood = (bank - bank[:, :1])[:, None] * np.array(powers)[:, None]
+    nats = np.clip(bank - bank[:, :1], IMPOSSIBLE, -IMPOSSIBLE)
+    likelihood = nats[:, None] * np.array(powers)[:, None]
     highest = likelihood.max(2)
     factors = np.exp(likelihood - highest[:, :, None])
     evidence = highest.sum(0)

@@ -272,6 +272,9 @@ def test_mean_courses_are_those_of_all_paths(law: HoldLaw, power: float) -> None
     np.testing.assert_allclose(course.counts, counts, atol=1e-9)
     assert course.evidence == pytest.approx(np.log(weights.sum()))
     assert course.cost == pytest.approx(rel_entr(posterior, prior).sum())
+    # Evidence far beyond what numbers can hold leaves a whole course.
+    (sure,) = holds.average_courses(1e4 * likelihood, chances, [power])
+    assert sure.counts.sum() == pytest.approx(6.0) and sure.cost >= 0.0
 
 
 def test_losses_are_fitted_where_a_third_of_the_samples_tells_them() -> None:

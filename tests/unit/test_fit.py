@@ -22,7 +22,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 Runs = tuple[list[Recording], list[Recording]]
-CPU = torch.device("cpu")
 TINY: dict[str, Any] = {
     "one_step_updates": 30, "one_step_batch": 32, "horizons_s": (0.2, 0.4), "updates": 20, "batch": 8, "validate_every": 10,
     "validation_s": 1.0, "width": 8,
@@ -61,7 +60,7 @@ def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings() -> N
     marked = []
     for number, part in enumerate(parts):
         marked.append(dataclasses.replace(part, q=np.full_like(part.q, number)))
-    windows = TrainingWindows(marked, MACHINE, 7, CPU)
+    windows = TrainingWindows(marked, MACHINE, 7, torch.device("cpu"))
     draws = [windows.draw(64, 0.25, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
     assert torch.equal(draws[0][0], draws[1][0])

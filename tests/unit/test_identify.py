@@ -17,8 +17,6 @@ from actuators.contracts import FitTask
 from actuators.identify import dead_time
 from actuators.models.linear import ArxFit, Hold
 
-CPU = torch.device("cpu")
-
 
 def test_the_dead_time_is_found_to_the_hundredth_where_a_joint_is_commanded() -> None:
     axis = make_axis(MACHINE)
@@ -43,7 +41,7 @@ def test_a_linear_machine_is_learned_by_the_linear_model(tmp_path: Path) -> None
     actuator = ArxFit(name="arx", ridge=1e-8).fit(FitTask(MACHINE, [run], [run], tmp_path))
     cut = open_loop.cut_windows([run], MACHINE, 5.0, 1.0)
     error, still = (
-        np.abs(open_loop.roll_out(model, MACHINE, cut, CPU) - cut.measured).max()
+        np.abs(open_loop.roll_out(model, MACHINE, cut, torch.device("cpu")) - cut.measured).max()
         for model in (actuator, Hold())
     )
     assert error < 0.02 * still

@@ -20,7 +20,6 @@ from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 
-CPU = torch.device("cpu")
 ARM = make_machine("a", "b")
 LOOPS = {
     "slow": {"dead_time_s": 0.1, "response_s": 0.05, "damping": 0.8, "play_rad": 0.03, "sag_rad": 0.02, "sag_slope": 0.05},
@@ -37,7 +36,7 @@ def record(servo: Servo, count: int, seconds: float = 16.0) -> list[Recording]:
     for run in range(count):
         steps = np.repeat(rng.uniform(-0.2, 0.2, (num // 25 + 1, ARM.num_joints)), 25, 0)[:num]
         u = np.where((t // 300) % 2 == 1, 0.3 * np.sin(0.02 * t), steps)
-        q = run_servo(servo.build(ARM, 1, CPU), ARM, u)
+        q = run_servo(servo.build(ARM, 1, torch.device("cpu")), ARM, u)
         q = q + 2e-4 * rng.standard_normal(q.shape)
         # A command acts on the position of the row after it.
         motion = make_motion(ARM, "log", ARM.period_s * np.arange(num - 1), u[1:], q[:-1])

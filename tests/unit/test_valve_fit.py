@@ -15,8 +15,6 @@ from actuators import open_loop
 from actuators.contracts import FitTask
 from brokk_rl.errors import RecordingError
 
-CPU = torch.device("cpu")
-
 
 def test_a_known_valve_is_found(tmp_path: Path) -> None:
     joints = tuple(replace(one, body=None) for one in MACHINE.joints[3:])
@@ -27,7 +25,9 @@ def test_a_known_valve_is_found(tmp_path: Path) -> None:
     runs = driven(pair, 6, 120.0, 0, truth)
     fitted = option("fit", "valve").fit(FitTask(pair, runs[:5], [], tmp_path))
     cut = open_loop.cut_windows(runs[5:], pair, 5.0, 2.0)
-    path, ideal = (open_loop.roll_out(one, pair, cut, CPU) for one in (fitted, truth))
+    path, ideal = (
+        open_loop.roll_out(one, pair, cut, torch.device("cpu")) for one in (fitted, truth)
+    )
     error, least = (np.sqrt(np.square(one - cut.measured).mean()) for one in (path, ideal))
     assert error < 1.2 * least + 1e-3
     for name in pair.joint_names:
