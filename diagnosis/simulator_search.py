@@ -107,7 +107,8 @@ class SimulatorSearch:
             # What a candidate earns where the simulator was fitted is no finding.
             gains = gains - np.maximum(reference.weigh_candidates(kind, candidates), 0.0)
         costs = NUMBER_NATS * _count_moved(kind, candidates)
-        if kind.name in self.shared or not _is_per_joint(kind):
+        varies = any(kind.numbers[name].per_joint for name in kind.fitted)
+        if kind.name in self.shared or not varies:
             best = np.full(gains.shape[1], (gains.sum(1) - costs).argmax())
             joints = np.ones(gains.shape[1], dtype=bool)
             nats = float(gains[best[0]].sum() - costs[best[0]])
@@ -149,8 +150,3 @@ def _count_moved(kind: EffectType, candidates: EffectValues) -> np.ndarray:
     """Return how many of its numbers each candidate of an effect moves, `(C,)`: at least one is free."""
     moved = [(candidates[n] != kind.numbers[n].none).any(1) for n in kind.fitted]
     return np.maximum(np.sum(moved, 0), 1)
-
-
-def _is_per_joint(kind: EffectType) -> bool:
-    """Return whether any number of an effect differs between joints."""
-    return any(kind.numbers[name].per_joint for name in kind.fitted)

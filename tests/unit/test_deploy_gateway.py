@@ -15,8 +15,6 @@ from deploy.bus.description import BusDescription
 from deploy.twin.gateway import LEVERS, NOBODY, PC, Gateway, GatewayState
 
 U = {"Command_q1": 0.4, "Command_q3": -0.2}
-FLOW = [0.4, 0.0, -0.2, 0.0, 0.0]
-STILL = [0.0] * 5
 HELD = {"DeadMan": 1, "RemoteOn": 1}
 
 
@@ -52,7 +50,7 @@ class Around:
         self.go(0.2)
         self.command["CommandMode"] = 1
         self.go(0.04)
-        assert self.flow() == (pytest.approx(FLOW), PC, GatewayState.PC)
+        assert self.flow() == (pytest.approx([0.4, 0.0, -0.2, 0.0, 0.0]), PC, GatewayState.PC)
         return self
 
     def stops_within_2_ms(self, state: GatewayState) -> None:
@@ -68,7 +66,7 @@ class Around:
         return flow.tolist(), source, state
 
     def is_still(self, state: GatewayState) -> bool:
-        return self.flow() == (STILL, NOBODY, state)
+        return self.flow() == ([0.0] * 5, NOBODY, state)
 
 
 @pytest.fixture

@@ -111,8 +111,8 @@ def pure_numbers(**values: float) -> np.ndarray:
 
 
 LAG_SYSTEM = ([1.0], [0.4, 1.0, 0.0])  # 1 / s (0.4 s + 1)
-RINGING_SYSTEM = ([1.0], [1.0, 0.4, 1.0, 0.0])
 RINGING = {"ringing_s": 2.0 * np.pi, "damping": 0.2}
+RINGING_SYSTEM = ([1.0], [1.0, 0.4, 1.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -318,6 +318,19 @@ def test_a_changed_joint_is_named_sized_and_proven(
     assert answer.gap and answer.gap.closed
     assert answer.gap.closed.mean > 0.8
     assert answer.selected[0].identified
+
+
+@pytest.mark.parametrize("at_stops", [True, False])
+def test_lost_frames_hold_stops_back_as_well_as_starts(at_stops: bool) -> None:
+    case = make_case(TWO_JOINTS)
+    for seed, one in zip((10, 11), case.field, strict=True):
+        received = np.random.default_rng(seed).random(len(one.u)) < 0.4
+        held = one.u[np.maximum.accumulate(np.where(received, np.arange(len(one.u)), 0))]
+        if not at_stops:
+            held = np.where(np.abs(held) > np.abs(one.u), one.u, held)
+        one.q[:] = record(TWO_JOINTS, one.u, move(held, 0.3, 1.0, seed)).q
+    named = {one.effect for one in diagnose(case).selected}
+    assert bool(named & {"frame_loss", "delay_jitter"}) == at_stops
 
 
 @pytest.mark.parametrize("group", ["rest", "starts"])

@@ -20,7 +20,6 @@ from diagnosis import effect_library
 CPU = torch.device("cpu")
 MACHINES = names("machine")
 # A typical size of an effect is small against the joint that has it, and not nothing.
-SMALL = 1e-4
 VALVE = {
     "asymmetry", "backlash", "compliance", "creep", "dead_band", "flow_gain", "flow_sharing", "load_dependence",
     "stiction", "thermal_drift",
@@ -70,7 +69,7 @@ def test_the_library_is_drawn_on_every_machine_with_sizes_that_fit_its_joints(na
     most = {"backlash.gap_rad": 0.02 if machine.interface == "position" else 0.01}
     for key in ("backlash.gap_rad", "quantisation.step_rad", "sensor_noise.sigma_rad"):
         if key in drawn:
-            assert (drawn[key] > SMALL * travel).all(), key
+            assert (drawn[key] > 1e-4 * travel).all(), key
             assert (drawn[key] < most.get(key, 0.01) * travel).all(), key
     if "encoder_bias.bias_rad" in drawn:
         assert (drawn["encoder_bias.bias_rad"] < 0.001 * travel).all()

@@ -229,8 +229,6 @@ FAMILIES = {
 }
 """Machine, mix, and a seed of each make."""
 MAKES = [(name, seed) for name, (_, _, seeds) in FAMILIES.items() for seed in seeds]
-HEAVY = {"heat", "overload_trip"}
-"""Causes that need longer or heavier work."""
 OF_FILES = {"joint_friction": 0.3, "joint_damping": 0.4, "joint_armature": 1.0}
 """Parts of effects on numbers of an MJCF file, which no mix has."""
 
@@ -266,7 +264,8 @@ def test_each_fault_and_cause_shows_on_the_joint_that_has_it_and_a_run_stands_al
         runs[effect] = replace(well, faults={effect: sizes})
     for effect, part in OF_FILES.items() if name == "servos" else ():
         runs[effect] = replace(well, faults={effect: {"part": part * only}})
-    for cause in sorted({*plants.causes} - HEAVY):
+    # Two causes need longer or heavier work.
+    for cause in sorted({*plants.causes} - {"heat", "overload_trip"}):
         runs[cause] = replace(well, faults={cause: {SEVERITY: 1.0 * only}})
     runs["well"] = replace(well, faults={plants.causes[0]: {SEVERITY: 0.0 * only}})
     u = wave(machine, 90 if name == "servos" else round(14.0 / machine.period_s))

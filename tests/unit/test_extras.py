@@ -19,8 +19,6 @@ from deploy.runtime.process_group import BUS_PRIORITY
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("brokk_rl", "tasks", "actuators", "perception", "deploy", "diagnosis", "exam", "study")
-VENDOR_DRIVERS = {"pyzed", "pyrealsense2"}
-"""Modules that come with a camera, not from a package index."""
 
 
 def _state_requirements() -> list[str]:
@@ -108,7 +106,8 @@ def test_the_command_names_the_extra_that_is_missing(light: dict[str, str], tmp_
 
 
 def test_every_foreign_package_of_the_code_comes_with_an_extra() -> None:
-    known = {*sys.stdlib_module_names, *ROOMS, "conf", *VENDOR_DRIVERS}
+    # The last two come with a camera, not from a package index.
+    known = {*sys.stdlib_module_names, *ROOMS, "conf", "pyzed", "pyrealsense2"}
     brought = _list_modules(*STATED)
     # These come with the packages that stand in pyproject.toml.
     brought |= {"hydra", "omegaconf", "yaml", "PIL", "tensordict", "rsl_rl", "warp"}

@@ -181,9 +181,6 @@ def test_every_update_keeps_the_addresses() -> None:
     assert (history.q.data_ptr(), history.u.data_ptr()) == before
 
 
-CPU = torch.device("cpu")
-
-
 @pytest.fixture
 def unseen(machine: Machine) -> Machine:
     joints = tuple(replace(joint, body=None) for joint in machine.joints)
@@ -191,7 +188,7 @@ def unseen(machine: Machine) -> Machine:
 
 
 @pytest.mark.parametrize(
-    "use", [lambda m: Kinematics(m), lambda m: Gravity(m, CPU), lambda m: compile_model(m, 0.01)]
+    "use", [Kinematics, lambda m: Gravity(m, torch.device("cpu")), lambda m: compile_model(m, 0.01)]
 )
 def test_what_needs_its_links_says_what_is_missing(unseen: Machine, use) -> None:
     with pytest.raises(ConfigError, match=r"'?unseen'? (is known by its joints|has no MJCF)"):

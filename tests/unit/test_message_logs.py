@@ -18,8 +18,6 @@ from mcap.writer import Writer
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
-BEGIN_NS = 1_700_000_000_000_000_000
-
 
 def make_topic_map(command: str, position: str, time: str = "log_time") -> Any:
     return make_map(f"/command:{command}", f"/state:{position}", time)
@@ -29,7 +27,7 @@ def list_rows() -> list[tuple[int, float, float]]:
     """Returns time in ns, command and position of each row."""
     signals = make_signals()
     rows = zip(signals["t"].tolist(), signals["u"].tolist(), signals["q"].tolist(), strict=True)
-    return [(BEGIN_NS + round(t * 1e9), u, q) for t, u, q in rows]
+    return [(1_700_000_000_000_000_000 + round(t * 1e9), u, q) for t, u, q in rows]
 
 
 def write_json(path: Path) -> Any:

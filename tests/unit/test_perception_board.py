@@ -102,9 +102,6 @@ def test_a_board_that_cannot_be_drawn_is_refused() -> None:
         draw_board(replace(board, dictionary="DICT_4X4_50", columns=12, rows=10), 0.03)
 
 
-SESSION = Session(out=".", seed=4, device="cpu")
-
-
 RIG = option("rig", "zed_2i_720p")
 
 
@@ -118,7 +115,7 @@ def find_corners(board: Charuco, studio: FrameRenderer, scenes: Any, number: int
 
 def test_a_board_on_the_arm_is_where_the_recording_says(tmp_path: Path) -> None:
     kind: BoardOnArm = option("scene", "board_on_arm")
-    scenes = BoardScenes(kind, RIG, SESSION)
+    scenes = BoardScenes(kind, RIG, Session(out=".", seed=4, device="cpu"))
     studio = FrameRenderer(
         rig=RIG, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
     )

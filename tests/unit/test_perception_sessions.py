@@ -340,7 +340,6 @@ def test_a_lens_file_without_a_number_or_with_impossible_ones_is_refused(
 
 
 EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-2.4, -0.3, 0.7))
-BALL_M = (-0.5, 0.15, 0.55)
 WORLD_FROM_BOARD = np.eye(4)[[2, 0, 1, 3]]
 """A board in the drilled face: its z axis is the world's x."""
 
@@ -351,7 +350,7 @@ def views() -> list[cuboid.View]:
     found = []
     for number, eye in enumerate(EYES_M):
         pose = cuboid.looking(eye, (0.1, 0.0, 0.3))
-        found.append(cuboid.seen(pose, (480, 270), 0.003, BALL_M, seed=number))
+        found.append(cuboid.seen(pose, (480, 270), 0.003, (-0.5, 0.15, 0.55), seed=number))
     return found
 
 

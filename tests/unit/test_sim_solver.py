@@ -11,7 +11,6 @@ from brokk_rl.sim.warp_solver import ContactSolver
 
 pytestmark = pytest.mark.usefixtures("warp_device")
 NUM_WORLDS = 64
-TOLERANCE = 1e-6
 
 
 def _arm(num_joints):
@@ -46,7 +45,7 @@ class Problem:
         self.data = mjw.make_data(self.model, NUM_WORLDS, nconmax=16, njmax=40)
         option = self.warp_model.opt
         option.iterations, option.ls_iterations, option.warn_overflow = iterations, 20, 0
-        option.tolerance.fill_(TOLERANCE)
+        option.tolerance.fill_(1e-6)
         for world in range(NUM_WORLDS):
             data = mujoco.MjData(self.model)
             data.qpos = random.uniform(-1.1, 1.1, num_joints)
