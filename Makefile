@@ -9,7 +9,7 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_VERSION ?= $(shell sed -n '/^name = "torch"$$/{n;s/.*"\(.*\)"/\1/p;}' uv.lock)
 GET_TORCH = $(UV) pip install --quiet --python $(BIN)/python --no-deps --default-index $(TORCH_INDEX) torch==$(TORCH_VERSION)
 NO_CUDA = $(shell sed -nE 's/^name = "(torch|triton|nvidia-.*|cuda-.*)"$$/--no-install-package \1/p' uv.lock)
-PRESET ?= $(shell nvidia-smi -L >/dev/null 2>&1 && echo preset=gpu experiment=direct task=flat sim.num_constraints=64 sim.parity_worlds=0 || echo preset=laptop)
+PRESET ?= $(shell nvidia-smi -L >/dev/null 2>&1 && echo preset=gpu_short || echo preset=laptop)
 
 .PHONY: help play train test test-all mutants results docs docs-commands dist check setup clean
 

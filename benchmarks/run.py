@@ -39,7 +39,7 @@ depends on, listed in its file, has changed since: today's may give another figu
 
 * **Strict success:** the tip is 0.10 m or more below the rim, inside the hole with 1 cm of clearance, tilted
   by 0.11 rad at most, and no contact force of the episode was above 10 kN.
-* **Inserted:** the same without force and tilt. Older tables without this column call it strict success.
+* **Inserted:** the same without force and tilt.
 * **Paper's criterion:** the weaker one of the paper.
 * **Plant:** a simulated machine that judges a policy. `mlp` is the network through which policies are
   trained, `hydraulic` the plant to which it was fitted; nothing was fitted to the others.

@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. On a plant from elsewhere 96/136, 9/32, 4/32 of 240 by cb40f7a4; of 80 others by 94a49848 37/47, 5/10, 1/11.",
+        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. On a plant from elsewhere 105/136, 14/32, 3/32 of 240 new machines by 40380d7f; before 133/183, 14/42, 5/43 of 320.",
         "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
@@ -61,7 +61,7 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "24 arms, answered once. Before: 28/28, 9/15, 0/11 of 78 others.",
+        "24 arms, answered once; one answer, to an outside cause, ended in an error that is mended. Before: 36/36, 12/20, 0/15 of 102 others.",
         "machine=so101 exam_plants=servos exam_mix=servos", 24, "servo_diagnosis", "servo",
     ),
     Measurement(
