@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. On a plant from elsewhere 105/136, 14/32, 3/32 of 240 new machines by 40380d7f; before 133/183, 14/42, 5/43 of 320.",
+        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. On a plant from elsewhere 33/45, 5/11, 1/11 of 80 new machines, 11/13 unknown, by 5449bcee; before 238/319, 28/74, 8/75 of 560.",
         "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
