@@ -93,7 +93,8 @@ def find_geometry_errors(case: GapCase, kinds: Sequence[EffectType]) -> list[Det
             worth[some] = gains[some] - NUMBER_NATS * count - DIRECT_NATS * num_names
     named = max(worth, key=worth.__getitem__)
     sizes = points.refine(named)
-    named = tuple(error for error in named if _is_large(error, sizes))
+    large = {number for number in sizes if abs(sizes[number][0]) >= MIN_SIZE * number.typical}
+    named = tuple(error for error in named if not large.isdisjoint(error))
     sizes = points.refine(named)
     found = []
     for kind in dict.fromkeys(error[0].kind for error in named):
@@ -121,11 +122,6 @@ def measure_scatter_growth(case: GapCase, kinds: Sequence[EffectType]) -> float:
 def _is_geometric(kind: EffectType) -> bool:
     sides = ("kinematics", "measurement")
     return kind.target.side in sides and kind.target.smooth and not kind.target.stochastic
-
-
-def _is_large(error: _GeometryError, sizes: _FittedSizes) -> bool:
-    """Return whether an error is large enough to be named."""
-    return any(abs(sizes[number][0]) >= MIN_SIZE * number.typical for number in error)
 
 
 def _describe_numbers(

@@ -107,8 +107,7 @@ class SimulatorSearch:
             # What a candidate earns where the simulator was fitted is no finding.
             gains = gains - np.maximum(reference.weigh_candidates(kind, candidates), 0.0)
         costs = NUMBER_NATS * _count_moved(kind, candidates)
-        varies = any(kind.numbers[name].per_joint for name in kind.fitted)
-        if kind.name in self.shared or not varies:
+        if kind.name in self.shared or not any(kind.numbers[n].per_joint for n in kind.fitted):
             best = np.full(gains.shape[1], (gains.sum(1) - costs).argmax())
             joints = np.ones(gains.shape[1], dtype=bool)
             nats = float(gains[best[0]].sum() - costs[best[0]])

@@ -34,17 +34,6 @@ def read_injections(folder: Path) -> Table:
     return rows
 
 
-def read_lateness(folder: Path) -> Table:
-    """Return the lateness of each process over the whole run."""
-    rows: Table = []
-    for one in load_json(folder / "run/timing.json")["processes"]:
-        row = {"process": one["process"], "cycles": one["cycles"], "missed": one["missed"]}
-        row["late, ms, 99 %"] = round(1e3 * one["late_p99_s"], 2)
-        row["longest, ms"] = round(1e3 * one["late_max_s"], 1)
-        rows.append(row)
-    return rows
-
-
 BEFORE = {
     "processes": "page dead or hung: flow for 20 s",
     "sensors": "no alarm, advice valid",
@@ -129,16 +118,5 @@ MEASUREMENTS = (
         code=CODE,
         read=read_injections,
         where="one core, 3 min",
-    ),
-    Measurement(
-        name="soak",
-        title="Lateness of the loop",
-        conditions="Policy and bus process against the twin for ten minutes, with the recorder and the page. A cycle is missed if it begins later than the next one.",
-        commands=(
-            "brokk preset=bench deploy=auto deploy.seconds=600 page.port=0 session.out={out}/run",
-        ),
-        code=CODE,
-        read=read_lateness,
-        where="two cores, 10 min",
     ),
 )

@@ -156,7 +156,7 @@ MEASUREMENTS = (
     Measurement(
         name="short_training_gpu",
         title="`make train` on a GPU",
-        conditions="As `make train`, with 2,048 worlds and larger steps; compiling takes half a minute before. The baseline is the classical controller.",
+        conditions="As `make train`, with 2,048 worlds and larger steps, these values typed one by one; compiling takes half a minute before. Baseline: the classical controller.",
         commands=tuple(
             f"brokk -m mode=train preset=gpu_short rl.budget.max_seconds={seconds} session.seed=1,2,3,4,5 sim.parity_worlds=0 evaluation.video=false session.out={{out}}/{seconds}"
             for seconds in SHORT_S

@@ -292,8 +292,7 @@ def _is_late_at_stops(joints: Sequence[FieldJoint], hold: HeldCourse) -> bool:
     side = joints[0].side
     held = hold_commands(side, hold.delays).u
     stops = np.where(np.abs(held) > np.abs(side.u), held, side.u)
-    gain = sum(_weigh_commands(joints, side.with_commands(stops)))
-    return gain > STOP_SHARE * sum(hold.gains)
+    return sum(_weigh_commands(joints, side.with_commands(stops))) > STOP_SHARE * sum(hold.gains)
 
 
 def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> HeldCourse | None:

@@ -25,12 +25,12 @@ class Room:
 # The bound is the size at the last change of this table. It only falls, until it is the budget.
 ROOMS = (
     Room(("brokk_rl", "tasks", "conf"), bound=12_501, budget=10_500),
-    Room(("actuators", "diagnosis", "exam"), bound=18_569, budget=16_500),
+    Room(("actuators", "diagnosis", "exam"), bound=18_566, budget=16_500),
     Room(("perception",), bound=9_500, budget=9_500),
     Room(("deploy",), bound=7_500, budget=7_500),
     Room(("study",), bound=1_800, budget=1_800),
     Room(("tests",), bound=26_737, budget=25_000),
-    Room(("benchmarks",), bound=1_906, budget=2_000),
+    Room(("benchmarks",), bound=1_853, budget=2_000),
 )
 
 
