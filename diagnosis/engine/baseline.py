@@ -50,6 +50,7 @@ class JointBaseline:
         motion: Motion of the simulated joint.
         left_out: Increments of the error of each part, numbers fitted to the others, `(N,)`.
         part: Part of each increment, `(N,)`.
+        slopes: Slopes of the increments over the fitted numbers, `(F, N)`.
         spread: Mean square of `left_out`.
         covariance: Of the fitted numbers, `(F, F)`.
         frame_variance: Coefficients of the variance of one sample's step.
@@ -63,6 +64,7 @@ class JointBaseline:
     motion: Motion
     left_out: np.ndarray
     part: np.ndarray
+    slopes: np.ndarray
     spread: float
     covariance: np.ndarray
     frame_variance: np.ndarray
@@ -234,6 +236,7 @@ def _leave_out(
         motion=motion,
         left_out=left_out,
         part=part,
+        slopes=slopes,
         spread=spread,
         covariance=np.linalg.inv(normal / max(spread, LEAST_SPREAD)),
         frame_variance=fit_variance(frames, motion, measure.valid),

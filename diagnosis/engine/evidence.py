@@ -144,8 +144,7 @@ class RowEvidence:
         self.covered = find_covered(reference, field)
         self.every = [*reference.model.rows, *reference.model.outside_rows]
         self.names = np.array([row.effect for row in self.every])
-        joints = range(reference.num_joints)
-        self.nuisances = [estimate_nuisance(reference, j, self.bases[j]) for j in joints]
+        self.nuisances = [estimate_nuisance(reference.model, base) for base in self.bases]
         self.steps = np.zeros(reference.num_joints)
         self.noises = np.zeros(reference.num_joints)
         self._viewed: dict[tuple[int, int, bytes], FieldJoint] = {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -98,15 +99,15 @@ class MeanCourse:
 
 def average_courses(
     bank: np.ndarray, chances: np.ndarray, powers: Sequence[float]
-) -> list[MeanCourse]:
-    """Return the mean of all courses under a law at each power of the likelihood.
+) -> list[list[MeanCourse]]:
+    """Return the mean of all courses under each law at each power of the likelihood.
 
     This is the forward and backward pass of a hidden Markov model. A single course is likely by chance where
     the commands say little. The mean of all stays there at what the law lets expect, and costs nothing.
 
     Args:
         bank: Log likelihood of each delay at each sample, `(T, K)`; no delay but 0 is possible at the first one.
-        chances: Chance that a delay (first axis) is followed by another one (second), `(K, K)`.
+        chances: Chance under each law that a delay (second axis) is followed by another one (third), `(L, K, K)`.
         powers: Powers of the likelihood.
     """
     nats = bank - bank[:, :1]
@@ -114,24 +115,34 @@ def average_courses(
     likelihood = nats[:, None] * np.array(powers)[:, None]
     highest = likelihood.max(2)
     factors = np.exp(likelihood - highest[:, :, None])
-    evidence = highest.sum(0)
-    posterior = np.zeros_like(factors)
-    posterior[0, :, 0] = 1.0
+    posterior = np.zeros((len(bank), len(chances), len(powers), bank.shape[1]))
+    posterior[0, :, :, 0] = 1.0
+    totals = np.ones(posterior.shape[:3])
     for k in range(1, len(bank)):
         state = (posterior[k - 1] @ chances) * factors[k]
-        total = np.maximum(state.sum(1), LEAST_CHANCE)
-        posterior[k] = state / total[:, None]
-        evidence += np.log(total)
-    later = np.ones_like(factors[0])
+        totals[k] = np.maximum(state.sum(2), LEAST_CHANCE)
+        posterior[k] = state / totals[k, :, :, None]
+    evidence = highest.sum(0) + np.log(totals).sum(0)
+    backwards = chances.swapaxes(1, 2)
+    later = np.ones_like(posterior[0])
     for k in reversed(range(len(bank))):
         posterior[k] *= later
-        posterior[k] /= np.maximum(posterior[k].sum(1, keepdims=True), LEAST_CHANCE)
-        later = (factors[k] * later) @ chances.T
-        later /= np.maximum(later.max(1, keepdims=True), LEAST_CHANCE)
+        posterior[k] /= np.maximum(posterior[k].sum(2, keepdims=True), LEAST_CHANCE)
+        later = (factors[k] * later) @ backwards
+        later /= np.maximum(later.max(2, keepdims=True), LEAST_CHANCE)
     delays = posterior @ np.arange(bank.shape[1])
-    costs = (posterior * likelihood).sum((0, 2)) - evidence
-    each = zip(delays.T, posterior.sum(0), evidence.tolist(), costs.tolist(), strict=True)
-    return [MeanCourse(*one) for one in each]
+    costs = np.einsum("tlmk,tmk->lm", posterior, likelihood) - evidence
+    found = []
+    for law in range(len(chances)):
+        each = zip(
+            delays[:, law].T,
+            posterior[:, law].sum(0),
+            evidence[law].tolist(),
+            costs[law].tolist(),
+            strict=True,
+        )
+        found.append([MeanCourse(*one) for one in each])
+    return found
 
 
 def _build_bank(
@@ -299,20 +310,18 @@ def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> H
     """Return the course that earns most, where one earns anything: that of the likeliest law at one of the powers."""
     side = joints[0].side
     numbers = [joint.numbers for joint in joints]
-    likeliest: list[tuple[HoldLaw, MeanCourse]] = []
+    courses: list[tuple[HoldLaw, list[MeanCourse]]] = []
     banks: dict[int, np.ndarray] = {}
-    for law in side.model.hold_laws:
-        if law.parts not in banks:
-            banks[law.parts] = _build_bank(side, bases, numbers, law.parts)
-        bank = banks[law.parts]
-        chances = law.list_chances(bank.shape[1], side.period_s)
-        each = [(law, course) for course in average_courses(bank, chances, POWERS)]
-        pairs = zip(likeliest or each, each, strict=True)
-        likeliest = [max(pair, key=lambda one: one[1].evidence) for pair in pairs]
+    for parts, some in groupby(side.model.hold_laws, lambda law: law.parts):
+        laws = list(some)
+        bank = banks[parts] = _build_bank(side, bases, numbers, parts)
+        chances = np.stack([law.list_chances(bank.shape[1], side.period_s) for law in laws])
+        courses += zip(laws, average_courses(bank, chances, POWERS), strict=True)
     best: HeldCourse | None = None
-    for power, (law, course) in zip(POWERS, likeliest, strict=True):
-        if course.evidence > 0.0:
-            hold = _weigh_course(joints, law, power, course)
+    for place, power in enumerate(POWERS):
+        law, each = max(courses, key=lambda one: one[1][place].evidence)
+        if each[place].evidence > 0.0:
+            hold = _weigh_course(joints, law, power, each[place])
             if hold.net > (best.net if best else 0.0):
                 best = hold
     if best is None or (side.model.integrates and not _is_late_at_stops(joints, best)):
@@ -332,7 +341,8 @@ def fit_loss_law(bank: np.ndarray, law: LossLaw, period_s: float) -> LossLaw:
     A frame that is lost between equal commands leaves no trace, and counts as the law lets expect.
     """
     for _ in range(LAW_ROUNDS):
-        (course,) = average_courses(bank, law.list_chances(bank.shape[1], period_s), [1.0])
+        chances = law.list_chances(bank.shape[1], period_s)
+        ((course,),) = average_courses(bank, chances[None], [1.0])
         law = LossLaw.count(course.counts)
     return law
 
@@ -345,5 +355,5 @@ def _seek_again(
     numbers = [joint.numbers for joint in joints]
     bank = _build_target_bank(side, bases, numbers, hold.law.parts, hold.delays)
     chances = hold.law.list_chances(bank.shape[1], side.period_s)
-    (course,) = average_courses(bank, chances, [hold.power])
+    ((course,),) = average_courses(bank, chances[None], [hold.power])
     return _weigh_course(joints, hold.law, hold.power, course)

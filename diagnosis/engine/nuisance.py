@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, linearise
+from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
+from diagnosis.engine.joint_model import JointModel
 from diagnosis.engine.side import Side
 
 STILL_UNITS_S = 0.02
@@ -111,11 +112,10 @@ def count_part(base: JointBaseline, part: int) -> float:
     return float(((base.part == part) & base.measure.valid).sum()) / base.measure.interval
 
 
-def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisance:
+def estimate_nuisance(model: JointModel, base: JointBaseline) -> JointNuisance:
     """Return the ageing of a joint: that of its kind, beside the uncertainty of the fit."""
-    ageing = side.model.list_ageing(base.numbers)
+    ageing = model.list_ageing(base.numbers)
     mix = np.linalg.cholesky(base.covariance + np.diag(ageing**2)).T
-    _, slopes = linearise(side, joint, base.numbers, base.measure)
-    columns = mix @ slopes
+    columns = mix @ base.slopes
     parts = [Projection(columns[:, base.part == k], base.spread) for k in range(NUM_PARTS)]
     return JointNuisance(mix, parts)
