@@ -256,7 +256,7 @@ def test_delays_follow_each_other_by_their_law(law: HoldLaw, expected: np.ndarra
 
 
 @pytest.mark.parametrize("law", [0, 1])
-@pytest.mark.parametrize(("place", "power"), enumerate((0.3, 1.0)))
+@pytest.mark.parametrize(("place", "power"), [(0, 0.3), (1, 1.0)])
 def test_mean_courses_are_those_of_all_paths(law: int, place: int, power: float) -> None:
     laws = (LossLaw(0.1, 0.7), JitterLaw(0.09))
     every = np.stack([one.list_chances(3, 0.05) for one in laws])
