@@ -40,7 +40,6 @@ NO_PROOF = "gates of the proof, and the decision alone"
 """The ingredient without which the other values of its constants are tried."""
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "no ageing": lambda model, numbers: np.zeros(len(model.fitted)),
-    "no price": lambda table, _, name: np.full((1, (table.names == name).sum()), -np.inf),
     "no price of columns": lambda causes, joint: defaultdict(float),
 }
 

@@ -253,7 +253,7 @@ def find_owners(
         if effect in SHARED or effect in outside:
             continue
         for j, row in rows.items():
-            net = row.gain - row.price - JOINT_NATS
+            net = row.gain - JOINT_NATS
             if net > 0.0:
                 best[j] = max(best.get(j, (0.0, "")), (net, effect))
     return {j: effect for j, (_, effect) in best.items()}
@@ -326,7 +326,7 @@ def share_cost(gains: Sequence[float], cost: float) -> list[float]:
 
 def add_up(effect: str, rows: Mapping[int, JointRow], is_outside: bool = False) -> EffectFinding:
     """Return an effect with the joints that it pays on."""
-    gains = {j: row.gain - row.price for j, row in rows.items()}
+    gains = {j: row.gain for j, row in rows.items()}
     is_common = effect in SHARED or effect.endswith("_all")
     if is_common:
         nets = dict(zip(gains, share_cost([*gains.values()], JOINT_NATS), strict=True))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
+from diagnosis.engine.baseline import JointBaseline, fit_reference, linearise
 from diagnosis.engine.coverage import find_covered
 from diagnosis.engine.descent import Prior, descend
 from diagnosis.engine.measure import IncrementMeasure, measure_motion
@@ -28,10 +28,10 @@ JOINT_NATS = 12.0
 """Cost of each joint of an effect, or of one that all share; for its size, its form, and the choice of the best row.
 
 The best row earns more than 11 nats on a tenth of the 384 left-out parts of the reference of 24 practice cranes.
-Size and price of an effect that earns less on a joint are not searched.
+The size of an effect that earns less on a joint is not searched.
 """
-SHARED_SPREAD = 0.08
-"""Standard deviation of the logarithm of a common size between joints."""
+SIZES_BETWEEN = (0.88, 0.92, 0.96, 1.0, 1.04, 1.08, 1.13)
+"""Factors between the sizes of the table, at which a common effect is sought."""
 LOSS_LIMIT = -20.0
 """A joint takes at most so many nats from a common effect."""
 
@@ -42,15 +42,11 @@ class JointRow:
 
     Attributes:
         row: The row, its size searched.
-        gain: Its gain on the field, nats.
-        price: The most that any row of the effect gains on a part of the reference, at the length
-            of the field, nats; 0 for a joint that takes speeds, and where the gain is too small to
-            be searched.
+        gain: Its gain on the field less what it earns on the reference, nats.
     """
 
     row: Row
     gain: float
-    price: float
 
 
 class FieldJoint:
@@ -106,8 +102,8 @@ class FieldJoint:
         squares = self.projection.measure_squares(left)
         return compute_gain(squares, self.squares, self.count)
 
-    def refine(self, row: Row) -> tuple[float, Row]:
-        """Return gain and row where the size and all shapes of a row fit best together."""
+    def refine(self, row: Row) -> Row:
+        """Return the row where the size and all shapes fit best together."""
         groups = [row.sizes, *row.shapes]
 
         def resize(logs: np.ndarray) -> Row:
@@ -124,8 +120,7 @@ class FieldJoint:
         # The deviation only keeps a size without any slope where it is.
         prior = Prior(none, 10.0 * most, LOG_STEP * most, -most, most)
         multiply = self.projection.multiply
-        best = resize(descend(simulate, self.residual, multiply, none, prior, REFINEMENTS))
-        return float(self.score([best])[0]), best
+        return resize(descend(simulate, self.residual, multiply, none, prior, REFINEMENTS))
 
 
 class RowEvidence:
@@ -148,35 +143,26 @@ class RowEvidence:
         self.steps = np.zeros(reference.num_joints)
         self.noises = np.zeros(reference.num_joints)
         self._viewed: dict[tuple[int, int, bytes], FieldJoint] = {}
-        self._prices: dict[tuple[int, str], np.ndarray] = {}
         self._weighed: dict[FieldJoint, tuple[np.ndarray, dict[str, JointRow]]] = {}
 
-    def _price(self, joint: int, name: str) -> np.ndarray:
-        """Return the gain of each row of an effect on each part of the reference, nats a second, `(parts, C)`.
+    def _price(self, joint: FieldJoint, row: Row) -> float:
+        """Return the most that a row earns on a left-out part of the reference, at the length of the field, nats.
 
-        A joint that takes speeds has none: of 14 practice machines with one effect 11 are named first without a
-        price, and 9 with it. Of seven unchanged or faint machines with servos one was accused without it, and two
-        were called unknown.
+        A joint that takes speeds pays nothing: of 14 practice machines with one effect 11 are named first without a
+        price, and 9 with it.
         """
-        if self.reference.model.integrates:
-            return np.zeros((1, int((self.names == name).sum())))
-        key = (joint, name)
-        if key not in self._prices:
-            base, side = self.bases[joint], self.reference
-            rows = [self.every[place] for place in np.flatnonzero(self.names == name)]
-            paths = side.simulate(joint, side.model.change(base.numbers, rows))
-            added = base.measure(paths) - base.measure(side.simulate(joint, base.numbers))
-            found = []
-            for k in range(NUM_PARTS):
-                own = base.part == k
-                part, count = self.nuisances[joint].parts[k], count_part(base, k)
-                residual = base.left_out[own].astype(np.float32)
-                before = float(part.measure_squares(residual)[0])
-                squares = part.measure_squares(residual - added[:, own])
-                seconds = count * base.measure.interval * side.period_s
-                found.append(compute_gain(squares, before, count) / seconds)
-            self._prices[key] = np.stack(found)
-        return self._prices[key]
+        side, base = self.reference, self.bases[joint.joint]
+        if side.model.integrates:
+            return 0.0
+        path = side.simulate(joint.joint, side.model.change(base.numbers, [row]))
+        added = base.measure(path) - base.measure(side.simulate(joint.joint, base.numbers))
+        earned = [0.0]
+        for k, part in enumerate(self.nuisances[joint.joint].parts):
+            own, count = base.part == k, count_part(base, k)
+            squares = part.measure_squares(base.left_out[own] - added[:, own])
+            before = float(part.measure_squares(base.left_out[own])[0])
+            earned.append(float(compute_gain(squares, before, count)[0]) / count)
+        return max(earned) * joint.count
 
     def view_field(
         self,
@@ -222,44 +208,28 @@ class RowEvidence:
         if joint in self._weighed:
             return self._weighed[joint]
         gains = joint.score(self.every)
-        seconds = joint.count * joint.measure.interval * self.field.period_s
         found = {}
         for name in dict.fromkeys(self.names.tolist()):
             places = np.flatnonzero(self.names == name)
             best = places[np.argmax(gains[places])]
             if name in SHARED or gains[best] < LOSS_LIMIT:
                 continue
-            gain = float(gains[best])
-            row = self.every[best]
-            price = 0.0
+            row, gain = self.every[best], float(gains[best])
             if gain > JOINT_NATS:
-                gain, row = joint.refine(row)
-                price = max(float(self._price(joint.joint, name).max()) * seconds, 0.0)
-            found[name] = JointRow(row, gain, price)
+                row = joint.refine(row)
+                gain = float(joint.score([row])[0]) - self._price(joint, row)
+            found[name] = JointRow(row, gain)
         self._weighed[joint] = (gains, found)
         return gains, found
 
     def weigh_common(self, name: str, joints: Sequence[FieldJoint]) -> dict[int, JointRow]:
-        """Return the rows of an effect that has about one size on all joints; its price is on the first."""
+        """Return the row of an effect that has one size on all joints."""
         tables = [self._weigh_joint(joint)[0] for joint in joints]
         places = np.flatnonzero(self.names == name)
         total = np.sum([np.maximum(gains[places], LOSS_LIMIT) for gains in tables], 0)
-        seconds = joints[0].count * joints[0].measure.interval * self.field.period_s
-        parts = [np.maximum(self._price(j.joint, name), -5.0 / seconds) for j in joints]
-        prices = np.maximum(np.sum(parts, 0).max(0) * seconds, 0.0)
-        best = int(np.argmax(total - prices))
-        row = self.every[places[best]]
-        tried = [row.resize(factor) for factor in (0.88, 0.92, 0.96, 1.0, 1.04, 1.08, 1.13)]
-        scores = np.stack([joint.score(tried) for joint in joints])
-        logs = np.log(np.abs([one.size for one in tried]))
-        off = 0.5 * np.square(logs[None] - logs[:, None]) / SHARED_SPREAD**2
-        around = scores[:, None, :] - off[None]
-        totals = np.maximum(around.max(2), LOSS_LIMIT).sum(0)
-        centre = int(np.argmax(totals))
-        found = {}
-        for joint, own in zip(joints, around[:, centre], strict=True):
-            size = int(np.argmax(own))
-            gain = max(float(own[size]), LOSS_LIMIT)
-            price = float(prices[best]) if joint is joints[0] else 0.0
-            found[joint.joint] = JointRow(tried[size], gain, price)
-        return found
+        row = self.every[places[int(np.argmax(total))]]
+        tried = [row.resize(factor) for factor in SIZES_BETWEEN]
+        scores = np.maximum([joint.score(tried) for joint in joints], LOSS_LIMIT)
+        best = int(np.argmax(scores.sum(0)))
+        gains = scores[:, best].tolist()
+        return {j.joint: JointRow(tried[best], gain) for j, gain in zip(joints, gains, strict=True)}

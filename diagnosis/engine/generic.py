@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
+from diagnosis.engine.baseline import JointBaseline
 from diagnosis.engine.evidence import FieldJoint, RowEvidence
 from diagnosis.engine.nuisance import (
     LEAST_SQUARE,
@@ -127,28 +127,26 @@ class GenericCauses:
         self._prices = [self._price(j) for j in range(evidence.reference.num_joints)]
 
     def _price(self, joint: int) -> dict[str, float]:
-        """Return the most that each group earns on a left-out part, nats a second."""
+        """Return the most that each group earns on a left-out part, nats an increment."""
         side, base = self._evidence.reference, self._evidence.bases[joint]
         path = side.simulate(joint, base.numbers)[0].astype(float)
-        parts = self._evidence.nuisances[joint].parts
         found = {}
         for name, columns in list_groups(side, joint, base, path).items():
             increments = base.measure(columns)
-            gains = []
-            for k in range(NUM_PARTS):
+            earned = [0.0]
+            for k, part in enumerate(self._evidence.nuisances[joint].parts):
                 own, count = base.part == k, count_part(base, k)
-                gain = compute_evidence(parts[k], base.left_out[own], increments[:, own], count)
-                gains.append(gain / (count * base.measure.interval * side.period_s))
-            found[name] = max(*gains, 0.0)
+                gain = compute_evidence(part, base.left_out[own], increments[:, own], count)
+                earned.append(gain / count)
+            found[name] = max(earned)
         return found
 
     def weigh(self, joint: FieldJoint) -> dict[str, float]:
         """Return what each group earns on a joint of the field, less its price, nats."""
         base = self._evidence.bases[joint.joint]
-        seconds = joint.count * joint.measure.interval * joint.side.period_s
         prices, found = self._prices[joint.joint], {}
         for name, columns in list_groups(joint.side, joint.joint, base, joint.path).items():
             increments = joint.measure(columns).astype(float)
             gain = compute_evidence(joint.projection, joint.residual, increments, joint.count)
-            found[name] = gain - prices[name] * seconds
+            found[name] = gain - prices[name] * joint.count
         return found

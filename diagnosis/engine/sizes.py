@@ -80,14 +80,14 @@ def size_finding(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[i
         if not some:
             continue
         best = some[int(np.argmax(joints[j].score(some)))]
-        _, row = joints[j].refine(best)
+        row = joints[j].refine(best)
         found[j] = SizedRow(row, _estimate_error(row, joints[j]))
     return found
 
 
 def fit_rows(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, Row]:
     """Return the rows of a finding with sizes fitted to these joints."""
-    return {j: joints[j].refine(row)[1] for j, row in finding.rows.items()}
+    return {j: joints[j].refine(row) for j, row in finding.rows.items()}
 
 
 def is_plain(row: Row, model: JointModel) -> bool:
@@ -212,7 +212,8 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
     if effect == "creep" and "creep" in values:
         return {"drift_rad_s": values["creep"] * unit}
     # Weight over the yield force, at the stretched arm.
-    share = _measure_stretched_share(joint, machine)
+    force = machine.bodies[joint].yield_force.value
+    share = float(measure_full_loads(machine)[joint]) * GRAVITY_M_S2 / force
     if effect == "sag":
         return {"load_rad": values["sag_load"] * unit / share}
     if effect == "creep":
@@ -220,11 +221,6 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
     # To first order the square root of the registry halves the sensitivity.
     lowering = 1.0 if "load_both" in values else 0.0
     return {"sensitivity": 2.0 * next(iter(values.values())) / share, "lowering": lowering}
-
-
-def _measure_stretched_share(joint: int, machine: Machine) -> float:
-    force = machine.bodies[joint].yield_force.value
-    return float(measure_full_loads(machine)[joint]) * GRAVITY_M_S2 / force
 
 
 def describe_hold(hold: HeldCourse, machine: Machine) -> dict[str, tuple[float, float]]:

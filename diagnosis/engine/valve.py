@@ -59,6 +59,8 @@ NUMBERS = (
     JointNumber("top_share"),
     JointNumber("start_command"),
     JointNumber("stop_ratio"),
+    JointNumber("breakaway"),
+    JointNumber("building_s"),
     JointNumber("load_opposing"),
     JointNumber("load_both"),
     JointNumber("load_alone"),
@@ -110,6 +112,10 @@ def _list_effect_rows() -> list[Row]:
     for s in spread_sizes(0.06, 0.6, 9):
         for ratio in (0.3, 0.6, 0.85):
             changes = (("start_command", "add", s), ("stop_ratio", "add", ratio))
+            rows.append(Row("stiction", changes))
+    for s in spread_sizes(0.03, 0.5, 9):
+        for building_s in (0.05, 0.17, 0.5):
+            changes = (("breakaway", "add", s), ("building_s", "add", building_s))
             rows.append(Row("stiction", changes))
     rows += _list_load_rows()
     for s in mirror_sizes(spread_sizes(0.0008, 0.03, 9)):
@@ -175,6 +181,7 @@ def _list_outside_rows() -> list[Row]:
 OWN_FORMS = frozenset(
     {
         ("filling_s",),
+        ("breakaway", "building_s"),
         ("load_both", "load_alone"),
         ("load_root", "load_alone", "load_constant"),
         ("ringing_s", "damping", "weight_rad_s2"),

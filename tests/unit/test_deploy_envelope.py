@@ -248,11 +248,6 @@ def list_corners(box: dict[str, Any]) -> np.ndarray:
     return np.array(corners)
 
 
-def make_box(link: int, center: Any, rotation: Any, half: Any, radius_m: float) -> dict[str, Any]:
-    names = ("link", "center_m", "rotation", "half_m", "radius_m")
-    return dict(zip(names, (link, center, rotation, half, radius_m), strict=True))
-
-
 @pytest.mark.parametrize("end_m", [(2.0, 0.0, 0.0), (1.0, 0.7, -0.5)])
 def test_capsules_enclose_boxes_and_balls(end_m: tuple[float, float, float]) -> None:
     draw = np.random.default_rng(3)
@@ -260,9 +255,10 @@ def test_capsules_enclose_boxes_and_balls(end_m: tuple[float, float, float]) -> 
     for number in range(6):
         rotation = np.linalg.qr(draw.normal(size=(3, 3)))[0]
         radius_m = 0.1 if number % 2 else 0.0
-        half = draw.uniform(0.01, 0.2, 3)
-        center_m = draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0])
-        boxes.append(make_box(1, center_m, rotation, half, radius_m))
+        box = {"link": 1, "rotation": rotation, "radius_m": radius_m}
+        box["half_m"] = draw.uniform(0.01, 0.2, 3)
+        box["center_m"] = draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0])
+        boxes.append(box)
     capsules = shapes.fit_capsules(boxes, np.array(end_m))
     assert 1 <= len(capsules) <= 2
     for box in boxes:

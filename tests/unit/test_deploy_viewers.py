@@ -119,17 +119,12 @@ def found(folder: Path) -> dict[str, list[Any]]:
     return found
 
 
-def read_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return points `(K, 3)` and colours `(K, 4)` of a cloud."""
-    data = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
-    return data[:, :12].copy().view("<f4").astype(float), data[:, 12:]
-
-
 def test_points_lie_where_the_depths_say(found: dict[str, list[Any]]) -> None:
     cloud, pose = found["camera/points"][0], found["tf/camera"][0]
     offsets = {one.name: one.offset for one in cloud.fields}
     assert offsets == {"x": 0, "y": 4, "z": 8, "red": 12, "green": 13, "blue": 14, "alpha": 15}
-    points_m, _ = read_cloud(cloud)
+    data = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
+    points_m = data[:, :12].copy().view("<f4").astype(float)
     turn, at = rotation(pose.rotation), pose.translation
     height_m = (points_m @ turn.T + np.array([at.x, at.y, at.z]))[:, 2]
     on_top = np.abs(height_m - BLOCK_M[1][2]) < 0.02

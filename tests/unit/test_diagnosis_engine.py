@@ -142,7 +142,7 @@ def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
 @pytest.mark.parametrize(("nats", "told"), [(131.9, False), (132.0, True)])
 def test_held_commands_earn_enough_beyond_a_dead_time(nats: float, told: bool) -> None:
     # 100 nats are left of the dead time when it has paid for a joint
-    late = {0: JointRow(Row("dead_time", (("delay_s", "add", 0.1),)), 112.0, 0.0)}
+    late = {0: JointRow(Row("dead_time", (("delay_s", "add", 0.1),)), 112.0)}
     given = {"field": None, "weigh_rows": lambda _: {}, "weigh_common": lambda *_: late}
     decider: Any = object.__new__(decide.Decider)
     decider.evidence = SimpleNamespace(**given)
@@ -154,19 +154,16 @@ def test_held_commands_earn_enough_beyond_a_dead_time(nats: float, told: bool) -
 
 def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
     row = Row("lag", (("command_lag_s", "add", 0.2),))
-    lag = {0: JointRow(row, 50.0, 0.0), 1: JointRow(row, 30.0, 0.0), 2: JointRow(row, 12.0, 0.0)}
-    backlash = {0: JointRow(row, 49.0, 0.0), 1: JointRow(row, 40.0, 6.0)}
-    table = {"lag": lag, "backlash": backlash, "hysteresis": {0: JointRow(row, 99.0, 0.0)}}
-    # each pays 12 nats for a joint; backlash pays 6 more on the second one
+    lag = {0: JointRow(row, 50.0), 1: JointRow(row, 30.0), 2: JointRow(row, 12.0)}
+    backlash = {0: JointRow(row, 49.0), 1: JointRow(row, 31.0)}
+    table = {"lag": lag, "backlash": backlash, "hysteresis": {0: JointRow(row, 99.0)}}
     expected = {0: "lag", 1: "backlash"}
     assert decide.find_owners(table, frozenset({"hysteresis"})) == expected
 
 
 def test_a_joint_that_a_common_cause_makes_worse_stays_as_it_was() -> None:
     row = Row("flow_sharing", (("demand_limit", "add", 1.0),))
-    found = decide.add_up(
-        "flow_sharing", {0: JointRow(row, LOSS_LIMIT, 0.0), 1: JointRow(row, 90.0, 0.0)}
-    )
+    found = decide.add_up("flow_sharing", {0: JointRow(row, LOSS_LIMIT), 1: JointRow(row, 90.0)})
     assert found.joints == (0, 1)
     assert set(found.rows) == {1}
 
@@ -174,7 +171,7 @@ def test_a_joint_that_a_common_cause_makes_worse_stays_as_it_was() -> None:
 def test_what_one_joint_alone_shows_is_no_heat_of_the_oil() -> None:
     row = Row("thermal_drift", (("thermal_share", "add", 0.2), ("thermal_s", "add", 90.0)))
     for other_nats, told in ((0.0, False), (60.0, True)):
-        rows = {0: JointRow(row, 90.0, 0.0), 1: JointRow(row, other_nats, 0.0)}
+        rows = {0: JointRow(row, 90.0), 1: JointRow(row, other_nats)}
         assert decide.add_up("thermal_drift", rows).shows_on_several == told
 
 

@@ -41,15 +41,11 @@ def follow(proposed: torch.Tensor, **numbers: Any) -> torch.Tensor:
     return torch.stack([model.step(row[None])[0].clone() for row in proposed])
 
 
-def of_q1(values: list[float]) -> torch.Tensor:
-    proposed = torch.zeros(len(values), 5)
-    proposed[:, 0] = torch.tensor(values)
-    return proposed
-
-
 def q1(values: list[float], **numbers: Any) -> list[float]:
     """Returns what is given on q1 where only q1 is asked for."""
-    found = follow(of_q1(values), **numbers)
+    proposed = torch.zeros(len(values), 5)
+    proposed[:, 0] = torch.tensor(values)
+    found = follow(proposed, **numbers)
     assert not found[:, 1:].any()
     return found[:, 0].tolist()
 

@@ -33,19 +33,14 @@ ARM = option("machine", "so101")
 """An arm of five position servos."""
 
 
-def step_commands(num: int = 40) -> np.ndarray:
-    u = np.full((num, ARM.num_joints), -0.5)
-    u[5:] = 0.5
-    return u
-
-
 @pytest.mark.parametrize("factor", [0.4, 1.6])
 def test_another_damping_is_that_of_the_servo_it_acts_on(factor: float) -> None:
     servo = replace(option("actuator", "servo"), damping=0.8, response_s=0.06, top_speed=50.0)
     spec = replace(option("effect", "damping"), joints=["pitch"], factor=factor)
     around = spec.wrap(servo.build(ARM, 1, CPU), ARM, 1, CPU)
     inside = replace(servo, damping={"pitch": 0.8 * factor, "other": 0.8}).build(ARM, 1, CPU)
-    found, expected = (run_servo(one, ARM, step_commands()) for one in (around, inside))
+    u = np.repeat([[-0.5] * ARM.num_joints, [0.5] * ARM.num_joints], [5, 35], 0)
+    found, expected = (run_servo(one, ARM, u) for one in (around, inside))
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

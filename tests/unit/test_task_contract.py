@@ -82,12 +82,6 @@ class HoldStill:
         return HoldStillProcess(machine, num_envs, device)
 
 
-def make_training() -> Any:
-    training = runs.small(max_env_steps=16 * runs.STEPS * 2)
-    training.runner["obs_groups"] = {"actor": ["policy"], "critic": ["policy"]}
-    return training
-
-
 def test_the_required_contract_is_enough_for_the_checker() -> None:
     check_task(HoldStill(), MACHINE)
     process = HoldStill().build(MACHINE, 1, CPU)
@@ -102,6 +96,8 @@ def test_the_shipped_tasks_offer_all_that_is_optional(name: str) -> None:
 def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    training = runs.small(max_env_steps=16 * runs.STEPS * 2)
+    training.runner["obs_groups"] = {"actor": ["policy"], "critic": ["policy"]}
     parts: dict[str, Any] = {
         "session": Session(out=str(tmp_path), seed=0, device="cpu"),
         "machine": MACHINE,
@@ -109,7 +105,7 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
         "task": HoldStill(),
         "actuator": option("actuator", "lag"),
         "follower": option("follower", "none"),
-        "rl": make_training(),
+        "rl": training,
     }
     evaluation = replace(load_part("evaluation"), episodes=4, num_recorded=1, video=False)
     parts |= {"effect": {}, "event": {}, "tracking": NoTracking(), "evaluation": evaluation}
