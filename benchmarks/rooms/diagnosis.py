@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others. On a plant from elsewhere 33/45, 5/11, 1/11 of 80 new machines, 11/13 unknown, by 5449bcee; before 238/319, 28/74, 8/75 of 560.",
+        "32 machines, answered once. A person drives 14 fields. The diagnosis has their equation of lag. Before: 64/81, 21/47, 2/35 of 232 others. On a plant from elsewhere 36/48, 3/12, 1/11 of 80 new machines, 5/9 unknown, by 3eca3039; before 271/364, 33/85, 9/86 of 640.",
         "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(

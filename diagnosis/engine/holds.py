@@ -290,7 +290,7 @@ def _weigh_commands(joints: Sequence[FieldJoint], held: Side) -> list[float]:
 
 
 def _is_late_at_stops(joints: Sequence[FieldJoint], hold: HeldCourse) -> bool:
-    """Return whether the course pays where it keeps joints moving, too.
+    """Return whether the course pays where it keeps joints moving, beside what delayed starts earn.
 
     A radio does not know what a command does; a slow pump or a soft joint delays starts alone.
     """

@@ -160,8 +160,8 @@ def simulate_path(
     """Integrate the speed behind the spool `which` of each candidate to a path, `(C, T)`; keep its demand of flow.
 
     The pump rises to what the heaviest joint needs and a margin beyond it; pressures are counted in margins.
-    A joint begins to move when the pump bears its own load. One that sticks moves when the pressure breaks it away; all
-    that comes through a small opening leaks past the piston before, and pressures are counted in what leaks.
+    A joint begins to move when the pump bears its own load. One that sticks stands until the pressure behind a piston that
+    leaks breaks it away; that pressure is counted in the speed that it makes leak away.
     Sub-steps begin and end with the delayed ones of the spool, so that no change of a command lies
     within one, and the path is a smooth function of the delay.
     """
