@@ -61,13 +61,13 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "24 arms, answered once; one answer, to an outside cause, ended in an error that is mended. Before: 36/36, 12/20, 0/15 of 102 others.",
+        "24 arms, answered once. Before: 44/44, 15/25, 0/19 of 126 others.",
         "machine=so101 exam_plants=servos exam_mix=servos", 24, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
         title="What the ingredients of the diagnosis decide",
-        conditions="96 practice machines of two draws; rows of 48 hold the first one. By 1602d216, of those 48: without ageing 13/17 alone, without variance by motion 7/17, 2/10 and 2/7 accused.",
+        conditions="96 practice machines of two draws; rows of 48 hold the first one. By 1602d216, of those 48: without ageing 13/17 alone, without variance by motion 7/17, 2/10 and 2/7 accused. By 3eca3039 with all 28/34, 12/20, 15/18.",
         commands=(
             "python benchmarks/diagnosis/ablations.py {out}/ablations.json <an exam: exam_plants=valves exam_recording=operators session.seed=71 exam.mix.num_cases=48> <another: session.seed=72>",
         ),
