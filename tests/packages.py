@@ -13,12 +13,6 @@ from brokk_rl import extensions
 EXAMPLE = Path(__file__).parents[1] / "examples/my_package/my_package"
 
 
-def forget_package(name: str) -> None:
-    """Forget the modules of a package that another test installed."""
-    for module in [one for one in sys.modules if one.split(".")[0] == name]:
-        del sys.modules[module]
-
-
 def install_package(
     folder: Path, name: str, files: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -26,7 +20,8 @@ def install_package(
 
     Modules of another test's package of the same name are forgotten first.
     """
-    forget_package(name)
+    for module in [one for one in sys.modules if one.split(".")[0] == name]:
+        del sys.modules[module]
     for path, text in {"__init__.py": "", "conf/__init__.py": "", **files}.items():
         (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / name / path).write_text(text)

@@ -71,16 +71,12 @@ def list_commands(block: str) -> Iterator[str]:
     yield from (line for line in lines.splitlines() if line.strip() and not line.startswith("#"))
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder that looks like the repository; what a command writes stays in it."""
+def type_page(page: Path, folder: Path) -> int:
+    """Type the commands of a page, print how each ended, and return how many failed."""
+    # The folder looks like the repository; what a command writes stays in it.
     for path in ROOT.iterdir():
         if path.name not in ("runs", "multirun", ".git"):
             (folder / path.name).symlink_to(path)
-
-
-def type_page(page: Path, folder: Path) -> int:
-    """Type the commands of a page, print how each ended, and return how many failed."""
-    make_folder(folder)
     environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     environment["PATH"] = f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}"
     num_failed = 0

@@ -16,6 +16,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.case import GapCase
+from diagnosis.engine.evidence import RowEvidence
 from diagnosis.engine.rows import Row
 from diagnosis.engine.servo import SERVO
 from diagnosis.engine.side import Side, stack_side
@@ -65,16 +66,13 @@ PAIR = replace(ARM, joints=ARM.joints[:2], name="pair")
 """Two servos of a tabletop arm."""
 
 
-def cut_joints(recording: Recording) -> Recording:
-    """Return a recording of the first joints only."""
-    count = PAIR.num_joints
-    return make_recording(PAIR, recording.u[:, :count], recording.q[:, :count])
-
-
 def record_pair(seeds: tuple[int, ...], **changes: float) -> list[Recording]:
     """Return recordings of the first joints of the arm, sound ones without changes."""
-    sound = {"lost": 0.0, "late_s": 0.0}
-    return [cut_joints(record_arm(seed, **(sound | changes))) for seed in seeds]
+    found = []
+    for seed in seeds:
+        arm = record_arm(seed, **({"lost": 0.0, "late_s": 0.0} | changes))
+        found.append(make_recording(PAIR, arm.u[:, :2], arm.q[:, :2]))
+    return found
 
 
 def stand_still(machine: Machine, u: np.ndarray) -> Side:
@@ -179,6 +177,17 @@ def test_weight_pulls_a_joint_from_its_target() -> None:
     pulled = side.simulate(joint, SERVO.change(numbers, [row]))[0]
     off = pulled[-1] - side.q[-1, joint]
     assert off == pytest.approx(0.05 * side.load[joint, -1], rel=1e-2)
+
+
+def test_a_row_pays_for_what_it_earns_on_a_left_out_part() -> None:
+    reference = stack_side(record_pair((1, 2)), PAIR)
+    evidence = RowEvidence(reference, reference)
+    joint, *_ = evidence.view_field([one.numbers for one in evidence.bases])
+    base, row = evidence.bases[0], SERVO.rows[-1]
+    added = joint.simulate([row])[0]
+    for part, is_paid in ((-1, False), (2, True)):
+        base.left_out[:] = np.where(base.part == part, added, 0.0)
+        assert (evidence._price(joint, row) > 20.0) == is_paid
 
 
 @pytest.mark.parametrize(

@@ -32,13 +32,9 @@ def asked(lead: Conductor) -> Conductor:
     return lead
 
 
-def open_study(lead: Conductor, port: int = 0) -> Any:
-    return served(StudyFeed(Scripted(SHOWN), lead), port=port, extensions=(StudyPages(lead),))
-
-
 @pytest.fixture
 def port(lead: Conductor) -> Iterator[int]:
-    with open_study(lead) as found:
+    with served(StudyFeed(Scripted(SHOWN), lead), extensions=(StudyPages(lead),)) as found:
         yield found
 
 
