@@ -67,7 +67,7 @@ MEASUREMENTS = (
     Measurement(
         name="ablations",
         title="What the ingredients of the diagnosis decide",
-        conditions="96 practice machines of two draws; rows of 48 hold the first one. By 1602d216, of those 48: without ageing 13/17 alone, without variance by motion 7/17, 2/10 and 2/7 accused. By 3eca3039 all 28/34, 12/20, 15/18.",
+        conditions="96 practice machines of two draws; rows of 48 hold the first one. By 1602d216, of those 48: without ageing 13/17 alone, without variance by motion 7/17, 2/10 and 2/7 accused. Just before 3eca3039 28/34, 12/20, 15/18.",
         commands=(
             "python benchmarks/diagnosis/ablations.py {out}/ablations.json <an exam: exam_plants=valves exam_recording=operators session.seed=71 exam.mix.num_cases=48> <another: session.seed=72>",
         ),
